@@ -1,0 +1,46 @@
+"""Visual loop-closure detection: is the robot back at a place that it has seen?
+
+The data flow is the folder list::
+
+    images/         folders, text files of paths, videos, the simulator      -> uint8 RGB
+    features/       backbones                                                -> feature maps
+    compression/    Karhunen-Loeve transform                                 -> smaller feature maps
+    aggregation/    NetVLAD, running mean                                    -> one descriptor a frame
+    matching/       map, sequences                                           -> scores of candidates
+    detect.py       LoopDetector: all of it, one frame at a time             -> decisions
+    evaluation/     truth and metrics        report/  pictures and pages     cli/  the commands
+
+`methods` is the table of systems that can be run, `config` holds every setting, `records` what travels between
+stages. Importing the package loads none of the stages.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from typing import Any
+
+__version__ = "0.1.0"
+
+_EXPORTS = {
+    "Config": "loopclosure.config",
+    "Decision": "loopclosure.records",
+    "ImageSequence": "loopclosure.images.sequence",
+    "LoopClosureError": "loopclosure.errors",
+    "LoopDetector": "loopclosure.detect",
+    "Reason": "loopclosure.records",
+}
+
+__all__ = sorted([*_EXPORTS, "__version__"])
+
+logging.getLogger(__name__).addHandler(logging.NullHandler())
+
+
+def __getattr__(name: str) -> Any:
+    if name in _EXPORTS:
+        return getattr(importlib.import_module(_EXPORTS[name]), name)
+    raise AttributeError(f"module 'loopclosure' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_EXPORTS])

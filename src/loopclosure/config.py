@@ -1,0 +1,259 @@
+"""Settings: one frozen section a stage, every default runs, an unknown key is an error that guesses.
+
+The command line and the Python interface take their defaults from here and nowhere else.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from loopclosure.errors import ConfigError, did_you_mean
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:  # pragma: no cover
+    import tomli as tomllib
+
+MAX_CONFIG_BYTES = 1 << 20
+EMBEDDED = "efficientnet-lite0"
+"""The backbone whose weights are installed with the library."""
+
+
+class Section(BaseModel):
+    """Base of all sections: frozen, no unknown keys, no NaN."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, protected_namespaces=())
+
+
+class Images(Section):
+    """How images are read."""
+
+    on_error: Literal["stop", "skip"] = Field("stop", description="an unreadable image: stop or skip")
+    max_megapixels: float = Field(64.0, gt=0, description="a larger image is refused before it is decoded")
+
+
+class Features(Section):
+    """Images to feature maps (paper 2.1)."""
+
+    backbone: str = Field(EMBEDDED, description="network, see `loopclosure weights`")
+    layer: str = Field("", description="tap: conv1..conv5, or s4 s8 s16 s32 of efficientnet-lite0")
+    weights: str = Field("default", description="'default', a name, a path, or 'random'")
+    height: int = Field(224, ge=32, le=2048, description="input height, pixels")
+    width: int = Field(224, ge=32, le=2048, description="input width, pixels")
+    backend: Literal["auto", "torch"] = Field("auto", description="what executes the network: auto or torch")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _default_layer(cls, values: Any) -> Any:
+        """Without a layer: the middle one of the embedded network, the paper's conv5 of the others."""
+        if isinstance(values, dict) and not values.get("layer"):
+            embedded = str(values.get("backbone", EMBEDDED)).startswith(EMBEDDED)
+            return values | {"layer": "s16" if embedded else "conv5"}
+        return values
+
+
+class Compression(Section):
+    """The Karhunen-Loeve transform (paper 2.2). One of `gamma`, `energy` and `components` rules."""
+
+    reading: Literal["channel", "sequence", "flat", "none"] = Field("channel", description="how Eq. 5-16 are read")
+    gamma: float | None = Field(0.6, ge=0, lt=1, description="share of the eigenvectors that is cut away (Eq. 16)")
+    energy: float | None = Field(None, gt=0, le=1, description="share of the energy that is kept (Eq. 15)")
+    components: int | None = Field(None, ge=1, description="number of eigenvectors that is kept")
+    whiten: bool = Field(False, description="scale every component to unit variance")
+
+    @model_validator(mode="after")
+    def _one_rule(self) -> Compression:
+        given = [name for name in ("gamma", "energy", "components") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"wants exactly one of gamma, energy and components, found {given or 'none'}")
+        if self.reading == "sequence" and self.energy is not None:
+            raise ValueError("the reading 'sequence' wants gamma or components: by energy, sequences differ in size")
+        return self
+
+
+class Aggregation(Section):
+    """Many local vectors to one descriptor (paper 2.3, Eq. 19)."""
+
+    clusters: int = Field(64, ge=1, le=4096, description="NetVLAD clusters K")
+    centre_window: int = Field(
+        60, ge=0, description="frames whose mean descriptor is taken out of each new one; 0 = nothing is taken out"
+    )
+
+
+class Learning(Section):
+    """What is learned from the images themselves where no fitted model is given."""
+
+    warm_up: int = Field(
+        30, ge=1, description="in one stream: frames of the first fit, never more than sequence.exclude_recent"
+    )
+    fit_frames: int = Field(500, ge=2, description="at most so many frames of a known traverse are fitted on")
+    refit_at: tuple[int, ...] = Field(
+        (60, 120, 240), description="in one stream: frame counts at which basis and clusters are learned anew"
+    )
+    max_kept_mb: float = Field(512.0, gt=0, description="memory for the maps that refits need; above it they end")
+    seed: int = Field(0, ge=0, description="of k-means and of samples")
+
+
+class Sequence(Section):
+    """Distance between image sequences (paper 2.3, Eq. 20)."""
+
+    length: int = Field(10, ge=1, le=10_000, description="frames l in a sequence")
+    exclude_recent: int = Field(30, ge=1, description="in one stream: frames nearer than this are no candidates")
+    direction: Literal["forward", "both"] = Field("forward", description="'both' also finds a street driven back")
+
+
+class Decide(Section):
+    """From the best score to a decision."""
+
+    threshold: float = Field(
+        0.6, ge=0, le=1, description="least similarity 1 - D of a loop; the paper's alpha is 1 - threshold"
+    )
+
+
+class Config(Section):
+    """All settings of a detector.
+
+    Examples
+    --------
+    >>> Config().sequence.length
+    10
+    >>> Config.preset("paper").compression.gamma
+    0.8
+    >>> Config().with_settings({"sequence.length": 5}).sequence.length
+    5
+    """
+
+    method: str = Field("kl-netvlad", description="see `loopclosure methods`")
+    images: Images = Images()
+    features: Features = Field(default_factory=lambda: Features.model_validate({}))
+    compression: Compression = Compression()
+    aggregation: Aggregation = Aggregation()
+    learning: Learning = Learning()
+    sequence: Sequence = Sequence()
+    decision: Decide = Decide()
+
+    @classmethod
+    def preset(cls, name: str) -> Config:
+        """Return the preset `name`; see `PRESETS`."""
+        if name not in PRESETS:
+            raise ConfigError(f"unknown preset '{name}'{did_you_mean(name, PRESETS)}; known: {', '.join(PRESETS)}")
+        return cls().with_settings(PRESETS[name])
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Config:
+        """Build a configuration from nested mappings, as `model_dump` and TOML files give them."""
+        return cls().with_settings(_flatten(values))
+
+    @classmethod
+    def from_toml(cls, path: str | os.PathLike[str]) -> Config:
+        """Read a TOML file with one table a stage over the defaults."""
+        return cls().with_settings(read_toml(path))
+
+    def flat(self) -> dict[str, Any]:
+        """Return every setting by its ``"stage.field"`` name."""
+        return _flatten(self.model_dump())
+
+    def with_settings(self, settings: Mapping[str, Any]) -> Config:
+        """Return a copy with ``"stage.field"`` settings replaced.
+
+        Text is converted to the type of the field. Setting one of ``compression.gamma``, ``.energy`` and
+        ``.components`` clears the other two, because only one of them can rule; setting ``features.backbone`` alone
+        chooses that network's default layer.
+
+        Raises
+        ------
+        ConfigError
+            For an unknown name (with the nearest known one) or a value out of range.
+        """
+        known = field_names()
+        values = self.model_dump()
+        if "features.backbone" in settings:
+            values["features"]["layer"] = None
+        if any(settings.get(f"compression.{rule}") not in (None, "none") for rule in _RULES):
+            values["compression"].update(dict.fromkeys(_RULES))
+        for name, value in settings.items():
+            if name not in known:
+                raise ConfigError(f"unknown setting '{name}'{did_you_mean(name, known)}")
+            section, _, field = name.rpartition(".")
+            target = values[section] if section else values
+            target[field] = _parse(name, value)
+        try:
+            return Config.model_validate(values)
+        except ValidationError as error:
+            raise ConfigError(_one_line(error)) from None
+
+
+_RULES = ("gamma", "energy", "components")
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "paper": {
+        "features.backbone": "resnet152",
+        "features.layer": "conv5",
+        "compression.gamma": 0.8,
+        "aggregation.clusters": 64,
+        "aggregation.centre_window": 0,
+        "sequence.length": 10,
+        "decision.threshold": 0.7,
+    },
+}
+"""Named configurations: settings over the defaults."""
+
+
+def field_names() -> list[str]:
+    """Return every setting as ``"stage.field"``, in the order of the stages."""
+    names = []
+    for name, field in Config.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Section):
+            names += [f"{name}.{inner}" for inner in field.annotation.model_fields]
+        else:
+            names.append(name)
+    return names
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a TOML file into ``"stage.field"`` settings."""
+    file = Path(path)
+    try:
+        if file.stat().st_size > MAX_CONFIG_BYTES:
+            raise ConfigError(f"{file} is larger than {MAX_CONFIG_BYTES} bytes: it is no configuration")
+        return _flatten(tomllib.loads(file.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise ConfigError(f"cannot read the configuration {file}: {error.strerror or error}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file} is not valid TOML: {error}") from None
+
+
+def _flatten(values: Mapping[str, Any]) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat.update({f"{name}.{inner}": inner_value for inner, inner_value in value.items()})
+        else:
+            flat[name] = value
+    return flat
+
+
+def _parse(name: str, value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    if value.lower() in ("none", "null") and name != "compression.reading":
+        return None
+    if name == "learning.refit_at":
+        return [part for part in value.replace(",", " ").split() if part]
+    return value
+
+
+def _one_line(error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    message = str(first["msg"]).removeprefix("Value error, ")
+    if first["type"] == "value_error":
+        return f"{where}: {message}"
+    return f"{where} = {first.get('input')!r}: {message[0].lower()}{message[1:]}"

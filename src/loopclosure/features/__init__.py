@@ -1,0 +1,1 @@
+"""Images to features: feature maps of networks, and what is drawn from an image without one."""

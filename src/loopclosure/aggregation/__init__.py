@@ -1,0 +1,1 @@
+"""Many local vectors to one descriptor for an image."""

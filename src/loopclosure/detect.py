@@ -1,0 +1,388 @@
+"""LoopDetector: images in, decisions out. Each stage is a line of `LoopDetector._step`, in the order of the paper."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from loopclosure import store
+from loopclosure.aggregation.centring import RunningMean, centre_traverse
+from loopclosure.config import Config
+from loopclosure.errors import FitError, ModelError
+from loopclosure.images.ahead import read_ahead
+from loopclosure.images.decode import check_image
+from loopclosure.matching.sequences import SequenceScores
+from loopclosure.methods import Method, PlaceMap, build_method
+from loopclosure.records import Decision, Reason
+from loopclosure.warmup import WarmUp
+
+Progress = Callable[[int, int], None]
+
+
+class Frames(Protocol):
+    """A traverse: uint8 RGB images (h, w, 3), None for an unreadable one. A list will do; so does `ImageSequence`."""
+
+    def __len__(self) -> int: ...
+    def __iter__(self) -> Iterator[np.ndarray | None]: ...
+    def __getitem__(self, index: int, /) -> np.ndarray | None: ...
+
+
+class LoopDetector:
+    """Tell, image by image, whether the robot is back at a place that it has seen.
+
+    With no model given the detector learns from the drive itself: the first frames (``learning.warm_up``, never more
+    than ``sequence.exclude_recent``, where no loop can be closed anyway) are collected, the method is fitted on them,
+    and fitted anew at the frame counts ``learning.refit_at``, each time on past frames only and without a second look
+    at an image. Against a reference traverse (`set_reference`) it is fitted on that traverse.
+
+    Parameters
+    ----------
+    config : Config, optional
+        All settings; the embedded default, or what `model` was fitted with.
+    model : path, optional
+        Folder that `save_model` or ``loopclosure fit`` wrote.
+    progress : callable, optional
+        ``progress(done, total)`` in bytes, where weights have to be downloaded.
+
+    Attributes
+    ----------
+    method : Method
+        What describes and compares images.
+    frames : int
+        Frames added so far.
+    scores : ndarray of float32, shape (n,)
+        Sequence score of the last frame to each frame of the map; NaN where that is no candidate.
+    learned_on : list of str
+        What the method was fitted on, in order.
+    seconds : dict of str to float
+        Time spent so far in each stage.
+
+    Raises
+    ------
+    ConfigError, WeightsError, ModelError
+        If the settings, the weights or the model cannot be used.
+
+    Examples
+    --------
+    >>> detector = LoopDetector()                                   # doctest: +SKIP
+    >>> for image in images:                                        # doctest: +SKIP
+    ...     decision = detector.add(image)
+    ...     if decision.accepted:
+    ...         print(decision.query, decision.match, decision.score)
+    """
+
+    def __init__(
+        self,
+        config: Config | None = None,
+        *,
+        model: str | os.PathLike[str] | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        header, arrays = store.load_arrays(model, kind="model") if model is not None else (None, {})
+        self.config = _agreed_config(config, header)
+        self.method: Method = build_method(self.config, progress=progress)
+        self.learned_on: list[str] = []
+        self.seconds = dict.fromkeys(("features", "learn", "describe", "match"), 0.0)
+        if header is not None:
+            self._restore_method(header, arrays)
+        self.frames = 0
+        self.scores = np.zeros(0, np.float32)
+        self._reference_frames: int | None = None
+        self._warm_up = None if self.method.fitted else WarmUp(self.config)
+        self._begin(self.method.new_map(), prior=None)
+
+    @property
+    def one_stream(self) -> bool:
+        """Whether candidates come from the drive itself, not from a reference traverse."""
+        return self._reference_frames is None
+
+    @property
+    def map_size(self) -> int:
+        """Frames that the map holds."""
+        return len(self._map)
+
+    def add(self, image: np.ndarray | None) -> Decision:
+        """Take the next frame and decide.
+
+        Parameters
+        ----------
+        image : ndarray of uint8, shape (h, w, 3), or None
+            RGB; frames may differ in size. None for a frame that could not be read: it keeps its place.
+
+        Returns
+        -------
+        Decision
+            Its `query` counts the frames added so far, from 0.
+
+        Raises
+        ------
+        ImageError
+            If the array is no such image.
+        FitError
+            If the first frames are too few for the method to be fitted on them.
+        """
+        features = self._features(image)
+        if self._warm_up is not None:
+            self._learn(self._warm_up, features)
+        query, self.frames = self.frames, self.frames + 1
+        if not self.method.fitted:
+            self.scores = np.full(query, np.nan, np.float32)
+            return _no_candidate(query, Reason.UNREADABLE if image is None else Reason.WARMING_UP)
+        self.scores = self._step(features)
+        return self._decide(query, readable=image is not None)
+
+    def detect(self, images: Iterable[np.ndarray | None]) -> Iterator[Decision]:
+        """Yield the decision of each frame: `add` frame by frame, with decoding running ahead."""
+        for image in read_ahead(images):
+            yield self.add(image)
+
+    def _step(self, features: np.ndarray | None) -> np.ndarray:
+        """Do the method: describe, take out what recent frames share, compare, sum over the sequence, remember."""
+        with self._timed("describe"):
+            descriptor = self._mean.centre(self._describe(features, self._recent))
+        with self._timed("match"):
+            similarities = self._map.similarities(descriptor)
+            scores = self._sequences.push(similarities)
+            if self.one_stream:
+                self._map.add(descriptor)
+        return scores
+
+    def _decide(self, query: int, *, readable: bool) -> Decision:
+        if not readable:
+            return _no_candidate(query, Reason.UNREADABLE)
+        if np.isnan(self.scores).all():
+            old_enough = not self.one_stream or query >= self.config.sequence.exclude_recent
+            return _no_candidate(query, Reason.SEQUENCE_TOO_SHORT if old_enough else Reason.TOO_RECENT)
+        match = int(np.nanargmax(self.scores))
+        score = float(self.scores[match])
+        accepted = score >= self.config.decision.threshold
+        return Decision(query, match, score, accepted, None, Reason.ACCEPTED if accepted else Reason.BELOW_THRESHOLD)
+
+    def set_reference(self, images: Frames, *, progress: Progress | None = None) -> None:
+        """Look for loops against another traverse, and no longer within the drive.
+
+        Parameters
+        ----------
+        images : sequence of (ndarray of uint8, shape (h, w, 3)) or None
+            The reference traverse in order; None for a frame that could not be read. With nothing fitted yet the
+            method is fitted on it.
+        progress : callable, optional
+            ``progress(done, total)`` in frames.
+        """
+        seen = {} if self.method.fitted else self._fit_on(images, source="reference traverse", progress=progress)
+        recent: deque[np.ndarray] = deque(maxlen=self.method.window)
+        described = []
+        for index, image in enumerate(read_ahead(images)):
+            features = seen[index] if index in seen else self._features(image)
+            described.append(self._describe(features, recent))
+            if progress:
+                progress(index + 1, len(images))
+        centred, mean = centre_traverse(np.stack(described), window=self._centre_window)
+        places = self.method.new_map()
+        places.extend(centred)
+        self._against(places, prior=mean)
+
+    def use_map_as_reference(self, config: Config | None = None) -> None:
+        """Start a new traverse whose candidates are the frames of the map, and only those.
+
+        Parameters
+        ----------
+        config : Config, optional
+            Settings from here on; those that the map was made with must not differ.
+        """
+        self.config = _agreed_config(config, self._header())
+        self._against(self._map, prior=self._mean.current)
+
+    def fit(self, images: Frames, *, source: str, progress: Progress | None = None) -> None:
+        """Fit the method on a traverse, in place of learning from the drive.
+
+        Parameters
+        ----------
+        images : sequence of (ndarray of uint8, shape (h, w, 3)) or None
+            At most ``learning.fit_frames`` of them, evenly spaced, are used.
+        source : str
+            What they are; kept in the model and in ``run.json``.
+        progress : callable, optional
+            ``progress(done, total)`` in frames.
+        """
+        self._fit_on(images, source=source, progress=progress)
+        self._warm_up = None
+        self._begin(self.method.new_map(), prior=None)
+
+    def _features(self, image: np.ndarray | None) -> np.ndarray | None:
+        with self._timed("features"):
+            return None if image is None else self.method.features([check_image(image)])[0]
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] += time.perf_counter() - start
+
+    def _describe(self, features: np.ndarray | None, recent: deque[np.ndarray]) -> np.ndarray:
+        if features is None:
+            return self.method.blank()
+        recent.append(features)
+        return self.method.describe(list(recent))
+
+    @property
+    def _centre_window(self) -> int:
+        return self.config.aggregation.centre_window if self.method.centred else 0
+
+    def _begin(self, places: PlaceMap, *, prior: np.ndarray | None) -> None:
+        """Start a traverse: nothing behind it but the map."""
+        window, sequence = self._centre_window, self.config.sequence
+        if window and not self.one_stream:
+            window = max(window, len(places))  # a whole traverse is compared with a whole traverse
+        self._map = places
+        self._mean = RunningMean(window, prior=prior)
+        self._recent: deque[np.ndarray] = deque(maxlen=self.method.window)
+        self._sequences = SequenceScores(
+            1 if self.method.window > 1 else sequence.length,
+            exclude_recent=sequence.exclude_recent if self.one_stream else 0,
+            both_directions=sequence.direction == "both",
+            history=sequence.length,
+        )
+
+    def _against(self, places: PlaceMap, *, prior: np.ndarray | None) -> None:
+        if not self.method.fitted or not len(places):
+            raise FitError("the reference is empty: add frames or set a reference traverse first")
+        self._warm_up = None
+        self._reference_frames = len(places)
+        self.frames = 0
+        self._begin(places, prior=prior)
+
+    def _learn(self, warm_up: WarmUp, features: np.ndarray | None) -> None:
+        """At a milestone of the warm-up, fit on the frames so far and go through them again, from their features."""
+        if warm_up.push(features):
+            with self._timed("learn"):
+                self.method.fit(warm_up.readable)
+            self.learned_on.append(f"frames 0 to {len(warm_up.kept) - 1} of the drive")
+            recent: deque[np.ndarray] = deque(maxlen=self.method.window)
+            described = np.stack([self._describe(item, recent) for item in warm_up.readable])
+            self._begin(self.method.new_map(), prior=centre_traverse(described, window=self._centre_window)[1])
+            for item in warm_up.kept[:-1]:
+                self._step(item)
+        if warm_up.finished:
+            self._warm_up = None
+
+    def _fit_on(self, images: Frames, *, source: str, progress: Progress | None) -> dict[int, np.ndarray]:
+        """Fit the method on evenly spaced frames and return the features of these, by index."""
+        learning = self.config.learning
+        first = self._features(next((image for image in images if image is not None), None))
+        if first is None:
+            raise FitError(f"none of the {len(images)} frames of the {source} can be read: nothing to fit on")
+        most = max(2, min(learning.fit_frames, int(learning.max_kept_mb * 1e6 / first.nbytes)))
+        chosen = _evenly_spaced(len(images), most)
+        seen = {}
+        for index, image in zip(chosen, read_ahead(images[i] for i in chosen), strict=True):
+            features = self._features(image)
+            if features is not None:
+                seen[index] = features
+            if progress:
+                progress(index + 1, len(images))
+        with self._timed("learn"):
+            self.method.fit(list(seen.values()) or [first])
+        self.learned_on = [f"{len(seen)} of {len(images)} frames of the {source}"]
+        return seen
+
+    def save_model(self, folder: str | os.PathLike[str]) -> Path:
+        """Write what was learned, without the map; ``LoopDetector(model=folder)`` starts with it."""
+        if not self.method.fitted:
+            raise FitError("nothing was fitted yet: no model to save")
+        return store.save_arrays(folder, kind="model", header=self._header(), arrays=self.method.to_arrays())
+
+    def save(self, folder: str | os.PathLike[str]) -> Path:
+        """Write the whole detector; `load` brings it back as if it had never stopped."""
+        parts = {
+            "method": self.method.to_arrays() if self.method.fitted else {},
+            "map": {"descriptors": self._map.to_array()},
+            "mean": self._mean.to_arrays(),
+            "sequences": self._sequences.to_arrays(),
+            "recent": {f"{i:06}": features for i, features in enumerate(self._recent)},
+            "warm_up": self._warm_up.to_arrays() if self._warm_up else {},
+        }
+        header = self._header() | {
+            "frames": self.frames,
+            "reference_frames": self._reference_frames,
+            "fitted": self.method.fitted,
+            "warming_up": self._warm_up is not None,
+        }
+        arrays = {f"{part}.{name}": array for part, items in parts.items() for name, array in items.items()}
+        return store.save_arrays(folder, kind="detector", header=header, arrays=arrays)
+
+    @classmethod
+    def load(cls, folder: str | os.PathLike[str], *, progress: Progress | None = None) -> LoopDetector:
+        """Bring back a detector that `save` wrote.
+
+        Raises
+        ------
+        ModelError
+            If the folder holds no detector of this format, or its weights are not the ones it was made with.
+        """
+        header, arrays = store.load_arrays(folder, kind="detector")
+        detector = cls(Config.from_dict(header["config"]), progress=progress)
+        if header["fitted"]:
+            detector._restore_method(header, store.part(arrays, "method"))
+        detector.frames = header["frames"]
+        detector._reference_frames = header["reference_frames"]
+        places = detector.method.new_map()
+        places.extend(store.part(arrays, "map")["descriptors"])
+        detector._begin(places, prior=None)
+        detector._mean = RunningMean.from_arrays(store.part(arrays, "mean"), window=detector._mean.window)
+        detector._sequences.restore(store.part(arrays, "sequences"))
+        detector._recent.extend(features for _, features in sorted(store.part(arrays, "recent").items()))
+        detector._warm_up = None
+        if header["warming_up"]:
+            detector._warm_up = WarmUp(detector.config).restore(store.part(arrays, "warm_up"))
+        return detector
+
+    def _header(self) -> dict[str, Any]:
+        return {
+            "config": self.config.model_dump(),
+            "learned_on": self.learned_on,
+            "provenance": self.method.provenance,
+        }
+
+    def _restore_method(self, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+        if header["provenance"] != self.method.provenance:
+            raise ModelError(
+                f"fitted with {header['provenance']}, here are {self.method.provenance}; fetch those weights"
+            )
+        self.method.restore(arrays)
+        self.learned_on = list(header["learned_on"])
+
+
+def _agreed_config(config: Config | None, header: Mapping[str, Any] | None) -> Config:
+    """Return the configuration, which must not contradict a model on anything that the model was fitted for."""
+    if header is None:
+        return config or Config()
+    fitted = Config.from_dict(header["config"])
+    if config is None:
+        return fitted
+    wanted, found = config.flat(), fitted.flat()
+    binding = [name for name in wanted if name.startswith(("features.", "compression.")) and name != "features.backend"]
+    if fitted.compression.reading == "sequence":
+        binding.append("sequence.length")
+    for name in ("method", *binding, "aggregation.clusters"):
+        if wanted[name] != found[name]:
+            raise ModelError(
+                f"the model was fitted with {name} = {found[name]}, wanted {wanted[name]}; "
+                "leave that setting out or fit again with it"
+            )
+    return config
+
+
+def _no_candidate(query: int, reason: Reason) -> Decision:
+    return Decision(query, None, None, accepted=False, inliers=None, reason=reason)
+
+
+def _evenly_spaced(count: int, most: int) -> list[int]:
+    return sorted({round(position) for position in np.linspace(0, count - 1, min(count, most))})

@@ -111,8 +111,8 @@ class Sequence(Section):
 class Decide(Section):
     """From the best score to a decision."""
 
-    threshold: float = Field(
-        0.6, ge=0, le=1, description="least similarity 1 - D of a loop; the paper's alpha is 1 - threshold"
+    threshold: float | None = Field(
+        None, description="least score of a loop, where a score is a similarity 1 - D; none = the method's own"
     )
 
 

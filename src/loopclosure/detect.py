@@ -18,7 +18,6 @@ from loopclosure.config import Config
 from loopclosure.errors import FitError, ModelError
 from loopclosure.images.ahead import read_ahead
 from loopclosure.images.decode import check_image
-from loopclosure.matching.sequences import SequenceScores
 from loopclosure.methods import Method, PlaceMap, build_method
 from loopclosure.records import Decision, Reason
 from loopclosure.warmup import WarmUp
@@ -96,7 +95,7 @@ class LoopDetector:
         self.scores = np.zeros(0, np.float32)
         self._reference_frames: int | None = None
         self._warm_up = None if self.method.fitted else WarmUp(self.config)
-        self._begin(self.method.new_map(), prior=None)
+        self._begin(prior=None)
 
     @property
     def one_stream(self) -> bool:
@@ -104,9 +103,20 @@ class LoopDetector:
         return self._reference_frames is None
 
     @property
+    def threshold(self) -> float:
+        """Least score of a loop."""
+        chosen = self.config.decision.threshold
+        return self.method.threshold if chosen is None else chosen
+
+    @property
     def map_size(self) -> int:
         """Frames that the map holds."""
         return len(self._map)
+
+    @property
+    def map_bytes(self) -> int:
+        """Bytes that the descriptors of the map take."""
+        return self._map.nbytes
 
     def add(self, image: np.ndarray | None) -> Decision:
         """Take the next frame and decide.
@@ -146,7 +156,9 @@ class LoopDetector:
     def _step(self, features: np.ndarray | None) -> np.ndarray:
         """Do the method: describe, take out what recent frames share, compare, sum over the sequence, remember."""
         with self._timed("describe"):
-            descriptor = self._mean.centre(self._describe(features, self._recent))
+            descriptor = self._describe(features, self._recent)
+            if self.method.centred:
+                descriptor = self._mean.centre(descriptor)
         with self._timed("match"):
             similarities = self._map.similarities(descriptor)
             scores = self._sequences.push(similarities)
@@ -162,7 +174,7 @@ class LoopDetector:
             return _no_candidate(query, Reason.SEQUENCE_TOO_SHORT if old_enough else Reason.TOO_RECENT)
         match = int(np.nanargmax(self.scores))
         score = float(self.scores[match])
-        accepted = score >= self.config.decision.threshold
+        accepted = score >= self.threshold
         return Decision(query, match, score, accepted, None, Reason.ACCEPTED if accepted else Reason.BELOW_THRESHOLD)
 
     def set_reference(self, images: Frames, *, progress: Progress | None = None) -> None:
@@ -184,9 +196,13 @@ class LoopDetector:
             described.append(self._describe(features, recent))
             if progress:
                 progress(index + 1, len(images))
-        centred, mean = centre_traverse(np.stack(described), window=self._centre_window)
-        places = self.method.new_map()
-        places.extend(centred)
+        mean, descriptors = None, iter(described)
+        if self.method.centred:
+            centred, mean = centre_traverse(np.stack(described), window=self._centre_window)
+            descriptors = iter(centred)
+        places = self.method.new_map(exclude_recent=0)
+        for descriptor in descriptors:
+            places.add(descriptor)
         self._against(places, prior=mean)
 
     def use_map_as_reference(self, config: Config | None = None) -> None:
@@ -198,7 +214,8 @@ class LoopDetector:
             Settings from here on; those that the map was made with must not differ.
         """
         self.config = _agreed_config(config, self._header())
-        self._against(self._map, prior=self._mean.current)
+        places = self.method.new_map(exclude_recent=0).restore(self._map.to_arrays())
+        self._against(places, prior=self._mean.current)
 
     def fit(self, images: Frames, *, source: str, progress: Progress | None = None) -> None:
         """Fit the method on a traverse, in place of learning from the drive.
@@ -214,7 +231,7 @@ class LoopDetector:
         """
         self._fit_on(images, source=source, progress=progress)
         self._warm_up = None
-        self._begin(self.method.new_map(), prior=None)
+        self._begin(prior=None)
 
     def _features(self, image: np.ndarray | None) -> np.ndarray | None:
         with self._timed("features"):
@@ -226,7 +243,7 @@ class LoopDetector:
         yield
         self.seconds[stage] += time.perf_counter() - start
 
-    def _describe(self, features: np.ndarray | None, recent: deque[np.ndarray]) -> np.ndarray:
+    def _describe(self, features: np.ndarray | None, recent: deque[np.ndarray]) -> Any:
         if features is None:
             return self.method.blank()
         recent.append(features)
@@ -236,20 +253,15 @@ class LoopDetector:
     def _centre_window(self) -> int:
         return self.config.aggregation.centre_window if self.method.centred else 0
 
-    def _begin(self, places: PlaceMap, *, prior: np.ndarray | None) -> None:
-        """Start a traverse: nothing behind it but the map."""
-        window, sequence = self._centre_window, self.config.sequence
-        if window and not self.one_stream:
-            window = max(window, len(places))  # a whole traverse is compared with a whole traverse
-        self._map = places
+    def _begin(self, *, prior: np.ndarray | None, reference: PlaceMap | None = None) -> None:
+        """Start a traverse: nothing behind it but the reference."""
+        window, exclude = self._centre_window, self.config.sequence.exclude_recent if self.one_stream else 0
+        if window and reference is not None:
+            window = max(window, len(reference))  # a whole traverse is compared with a whole traverse
+        self._map = self.method.new_map(exclude_recent=exclude) if reference is None else reference
         self._mean = RunningMean(window, prior=prior)
         self._recent: deque[np.ndarray] = deque(maxlen=self.method.window)
-        self._sequences = SequenceScores(
-            1 if self.method.window > 1 else sequence.length,
-            exclude_recent=sequence.exclude_recent if self.one_stream else 0,
-            both_directions=sequence.direction == "both",
-            history=sequence.length,
-        )
+        self._sequences = self.method.new_scores(exclude_recent=exclude)
 
     def _against(self, places: PlaceMap, *, prior: np.ndarray | None) -> None:
         if not self.method.fitted or not len(places):
@@ -257,7 +269,7 @@ class LoopDetector:
         self._warm_up = None
         self._reference_frames = len(places)
         self.frames = 0
-        self._begin(places, prior=prior)
+        self._begin(prior=prior, reference=places)
 
     def _learn(self, warm_up: WarmUp, features: np.ndarray | None) -> None:
         """At a milestone of the warm-up, fit on the frames so far and go through them again, from their features."""
@@ -265,13 +277,16 @@ class LoopDetector:
             with self._timed("learn"):
                 self.method.fit(warm_up.readable)
             self.learned_on.append(f"frames 0 to {len(warm_up.kept) - 1} of the drive")
-            recent: deque[np.ndarray] = deque(maxlen=self.method.window)
-            described = np.stack([self._describe(item, recent) for item in warm_up.readable])
-            self._begin(self.method.new_map(), prior=centre_traverse(described, window=self._centre_window)[1])
+            self._begin(prior=self._mean_descriptor(warm_up.readable) if self.method.centred else None)
             for item in warm_up.kept[:-1]:
                 self._step(item)
         if warm_up.finished:
             self._warm_up = None
+
+    def _mean_descriptor(self, features: list[np.ndarray]) -> np.ndarray | None:
+        recent: deque[np.ndarray] = deque(maxlen=self.method.window)
+        described = np.stack([self._describe(item, recent) for item in features])
+        return centre_traverse(described, window=self._centre_window)[1]
 
     def _fit_on(self, images: Frames, *, source: str, progress: Progress | None) -> dict[int, np.ndarray]:
         """Fit the method on evenly spaced frames and return the features of these, by index."""
@@ -303,7 +318,7 @@ class LoopDetector:
         """Write the whole detector; `load` brings it back as if it had never stopped."""
         parts = {
             "method": self.method.to_arrays() if self.method.fitted else {},
-            "map": {"descriptors": self._map.to_array()},
+            "map": self._map.to_arrays(),
             "mean": self._mean.to_arrays(),
             "sequences": self._sequences.to_arrays(),
             "recent": {f"{i:06}": features for i, features in enumerate(self._recent)},
@@ -312,6 +327,7 @@ class LoopDetector:
         header = self._header() | {
             "frames": self.frames,
             "reference_frames": self._reference_frames,
+            "centre_window": self._mean.window,
             "fitted": self.method.fitted,
             "warming_up": self._warm_up is not None,
         }
@@ -333,10 +349,9 @@ class LoopDetector:
             detector._restore_method(header, store.part(arrays, "method"))
         detector.frames = header["frames"]
         detector._reference_frames = header["reference_frames"]
-        places = detector.method.new_map()
-        places.extend(store.part(arrays, "map")["descriptors"])
-        detector._begin(places, prior=None)
-        detector._mean = RunningMean.from_arrays(store.part(arrays, "mean"), window=detector._mean.window)
+        detector._begin(prior=None)
+        detector._map.restore(store.part(arrays, "map"))
+        detector._mean = RunningMean.from_arrays(store.part(arrays, "mean"), window=header["centre_window"])
         detector._sequences.restore(store.part(arrays, "sequences"))
         detector._recent.extend(features for _, features in sorted(store.part(arrays, "recent").items()))
         detector._warm_up = None

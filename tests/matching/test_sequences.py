@@ -63,7 +63,7 @@ def test_distance_of_unit_descriptors_is_the_equation():
     query /= np.linalg.norm(query, axis=1, keepdims=True)
     history /= np.linalg.norm(history, axis=1, keepdims=True)
     places, scores = VectorMap(), SequenceScores(4)
-    places.extend(history)
+    places.restore({"descriptors": history})
     for descriptor in query:
         last = scores.push(places.similarities(descriptor))
     distance = sum(np.sum((p - h) ** 2) for p, h in zip(query, history, strict=True)) / 4 / 4
@@ -86,8 +86,8 @@ def test_map_grows_without_changing_what_it_holds():
     descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
     places = VectorMap()
     assert places.similarities(descriptors[0]).shape == (0,)
-    places.extend(descriptors)
-    np.testing.assert_array_equal(places.to_array(), descriptors)
+    places.restore({"descriptors": descriptors})
+    np.testing.assert_array_equal(places.to_arrays()["descriptors"], descriptors)
     wanted = 1 - np.square(descriptors - descriptors[7]).sum(1) / 4
     np.testing.assert_allclose(places.similarities(descriptors[7]), wanted, atol=1e-6)
     assert np.argmax(places.similarities(descriptors[7])) == 7
@@ -98,7 +98,7 @@ def test_sets_are_compared_by_best_counterparts():
     sets = rng.normal(size=(3, 2, 5)).astype(np.float32)
     sets /= np.linalg.norm(sets, axis=2, keepdims=True)
     places = SetMap()
-    places.extend(sets)
+    places.restore({"descriptors": sets})
     got = places.similarities(sets[1])
     for n in range(3):
         cosines = [[float(a @ b) for b in sets[1]] for a in sets[n]]

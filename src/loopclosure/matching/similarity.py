@@ -31,6 +31,11 @@ class VectorMap:
     def __len__(self) -> int:
         return self._length
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the stored descriptors take."""
+        return sum(block.nbytes for block in self._filled())
+
     def add(self, descriptor: np.ndarray) -> None:
         """Store one frame.
 
@@ -73,14 +78,15 @@ class VectorMap:
     def _filled(self) -> list[np.ndarray]:
         return [block[: self._length - i * _BLOCK] for i, block in enumerate(self._blocks)]
 
-    def to_array(self) -> np.ndarray:
-        """Return all stored descriptors, shape (n, d) or (n, s, d)."""
-        return np.concatenate(self._filled()) if self._blocks else np.zeros((0, 0), np.float32)
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return the stored descriptors, shape (n, d) or (n, s, d), for `loopclosure.store`."""
+        return {"descriptors": np.concatenate(self._filled())} if self._blocks else {}
 
-    def extend(self, descriptors: np.ndarray) -> None:
-        """Store several frames, shape (n, d) or (n, s, d)."""
-        for descriptor in descriptors:
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> VectorMap:
+        """Store what `to_arrays` gave."""
+        for descriptor in arrays.get("descriptors", ()):
             self.add(descriptor)
+        return self
 
 
 class SetMap(VectorMap):
@@ -93,9 +99,3 @@ class SetMap(VectorMap):
     def _cosines(self, block: np.ndarray, descriptor: np.ndarray) -> np.ndarray:
         pairs = block @ descriptor.T
         return (pairs.max(1).mean(1) + pairs.max(2).mean(1)) / 2
-
-
-def map_from_arrays(arrays: Mapping[str, np.ndarray], *, into: VectorMap) -> VectorMap:
-    """Fill an empty map with what `to_array` returned under the key ``descriptors``."""
-    into.extend(arrays["descriptors"])
-    return into

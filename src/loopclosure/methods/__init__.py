@@ -2,69 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
-
-import numpy as np
 
 from loopclosure.config import Config
 from loopclosure.errors import ConfigError, did_you_mean
+from loopclosure.methods.base import Method, PlaceMap, Scores
 
 ProgressCallback = Callable[[int, int], None]
-
-
-class PlaceMap(Protocol):
-    """Descriptors of all frames seen so far."""
-
-    def __len__(self) -> int: ...
-    def add(self, descriptor: np.ndarray) -> None:
-        """Store one frame."""
-
-    def extend(self, descriptors: np.ndarray) -> None:
-        """Store several frames."""
-
-    def similarities(self, descriptor: np.ndarray) -> np.ndarray:
-        """Compare one frame with all stored ones: float32 (n,), larger = more alike."""
-
-    def to_array(self) -> np.ndarray:
-        """Return all stored descriptors, the first axis over frames."""
-
-
-class Method(Protocol):
-    """One way to tell whether two frames show the same place; `detect.LoopDetector` does the rest."""
-
-    centred: bool
-    fitted: bool
-
-    @property
-    def window(self) -> int:
-        """Frames whose features one descriptor is made of."""
-
-    @property
-    def provenance(self) -> dict[str, Any]:
-        """Where the learned parts came from."""
-
-    def features(self, images: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Turn uint8 RGB images into one array of features each: the costly part."""
-
-    def fit(self, maps: Sequence[np.ndarray]) -> None:
-        """Learn from the features of consecutive frames."""
-
-    def describe(self, maps: Sequence[np.ndarray]) -> np.ndarray:
-        """Describe the newest of the last `window` frames from their features."""
-
-    def blank(self) -> np.ndarray:
-        """Return the descriptor of a frame that says nothing."""
-
-    def new_map(self) -> PlaceMap:
-        """Return an empty map for the descriptors."""
-
-    def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return what was learned."""
-
-    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Take over what `to_arrays` gave."""
 
 
 @dataclass(frozen=True)
@@ -118,3 +63,6 @@ def build_method(config: Config, *, progress: ProgressCallback | None = None) ->
             f"unknown method '{config.method}'{did_you_mean(config.method, METHODS)}; known: {', '.join(METHODS)}"
         )
     return METHODS[config.method].build(config, progress)
+
+
+__all__ = ["METHODS", "Method", "MethodEntry", "PlaceMap", "Scores", "build_method"]

@@ -13,10 +13,11 @@ from loopclosure.config import Config
 from loopclosure.errors import FitError
 from loopclosure.features.backbones import Backbone
 from loopclosure.matching.similarity import SetMap, VectorMap
+from loopclosure.methods.base import Method
 from loopclosure.store import part
 
 
-class KLNetVLAD:
+class KLNetVLAD(Method):
     """Describe images by compressed ConvNet features.
 
     The reading of the KL transform (``compression.reading``) decides what a frame's descriptor is:
@@ -38,11 +39,12 @@ class KLNetVLAD:
         ``progress(done, total)`` in bytes, where weights have to be downloaded.
     """
 
+    fitted = False
     centred = True
-    """Descriptors of one traverse share its light and camera: take their running mean out."""
+    threshold = 0.6
 
     def __init__(self, config: Config, *, progress: Callable[[int, int], None] | None = None) -> None:
-        self.config = config
+        super().__init__(config)
         features = config.features
         self.backbone = Backbone(
             features.backbone,
@@ -58,12 +60,8 @@ class KLNetVLAD:
         if self._reading != "none":
             self._kl = READINGS[self._reading](**self._rule)
         self._netvlad = NetVLAD(config.aggregation.clusters, seed=config.learning.seed)
-        self.fitted = False
-
-    @property
-    def window(self) -> int:
-        """Frames whose features one descriptor is made of."""
-        return self.config.sequence.length if self._reading == "sequence" else 1
+        if self._reading == "sequence":
+            self.window = config.sequence.length
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -74,9 +72,9 @@ class KLNetVLAD:
         """Return the feature map of each image, float32 (h, w, c) (Eq. 2-4)."""
         return list(self.backbone.maps(images)[self.config.features.layer])
 
-    def fit(self, maps: Sequence[np.ndarray]) -> None:
+    def fit(self, features: Sequence[np.ndarray]) -> None:
         """Learn the KL basis and the NetVLAD clusters from feature maps of consecutive frames."""
-        stacked = np.stack(maps)
+        stacked = np.stack(features)
         if self._reading == "sequence":
             starts = range(0, len(stacked), self.window)
             self._netvlad.fit(
@@ -89,12 +87,12 @@ class KLNetVLAD:
                 self._netvlad.fit(self._compress(stacked))
         self.fitted = True
 
-    def describe(self, maps: Sequence[np.ndarray]) -> np.ndarray:
+    def describe(self, features: Sequence[np.ndarray]) -> np.ndarray:
         """Describe the newest of the last `window` frames.
 
         Parameters
         ----------
-        maps : sequence of ndarray of float32, each of shape (h, w, c)
+        features : sequence of ndarray of float32, each of shape (h, w, c)
             At most `window` of them, oldest first.
 
         Returns
@@ -103,7 +101,7 @@ class KLNetVLAD:
         """
         if not self.fitted:
             raise FitError("the method has learned no basis and no clusters yet; call fit first")
-        stacked = np.stack(maps)
+        stacked = np.stack(features)
         if self._reading == "sequence":
             return self._netvlad.transform(self._compress(self._padded(stacked)))
         code = self._compress(stacked)
@@ -124,7 +122,7 @@ class KLNetVLAD:
         black = np.zeros((self.config.features.height, self.config.features.width, 3), np.uint8)
         return np.zeros_like(self.describe(self.features([black])))
 
-    def new_map(self) -> VectorMap:
+    def new_map(self, *, exclude_recent: int) -> VectorMap:  # noqa: ARG002  (all pairs cost the same here)
         """Return an empty map for the descriptors."""
         return SetMap() if self._reading == "sequence" else VectorMap()
 

@@ -30,6 +30,10 @@ class FitError(LoopClosureError):
     """A learned stage cannot be fitted to these data, or is used before it was fitted."""
 
 
+class ResultsError(LoopClosureError):
+    """A run folder or a log of loops cannot be read, or contradicts itself."""
+
+
 class TruthError(LoopClosureError):
     """A truth file cannot be read, or does not belong to these results."""
 

@@ -15,6 +15,7 @@ SMALL = {
     "aggregation.centre_window": 15,
     "sequence.length": 4,
     "decision.threshold": 0.57,
+    "decision.consistency": 1,
     "sequence.exclude_recent": 10,
     "learning.refit_at": (20, 30),
 }
@@ -81,6 +82,13 @@ def test_learns_anew_at_the_milestones_and_says_so(two_laps):
     bounded = LoopDetector(small(learning__max_kept_mb=1e-6))
     list(bounded.detect(two_laps))
     assert bounded.learned_on == ["frames 0 to 9 of the drive"]
+
+
+def test_a_loop_must_be_led_up_to(two_laps):
+    first_full = 24 + 3
+    decisions = list(LoopDetector(small(decision__consistency=6)).detect(two_laps))
+    assert all(d.reason is Reason.INCONSISTENT and not d.accepted for d in decisions[first_full : first_full + 4])
+    assert all(d.accepted for d in decisions[first_full + 5 :])
 
 
 @pytest.mark.parametrize("reading", ["channel", "flat", "sequence", "none"])

@@ -34,7 +34,7 @@ class Section(BaseModel):
 class Images(Section):
     """How images are read."""
 
-    on_error: Literal["stop", "skip"] = Field("stop", description="an unreadable image: stop or skip")
+    on_error: Literal["stop", "skip"] = Field("stop", description="what an unreadable image does")
     max_megapixels: float = Field(64.0, gt=0, description="a larger image is refused before it is decoded")
 
 
@@ -46,15 +46,14 @@ class Features(Section):
     weights: str = Field("default", description="'default', a name, a path, or 'random'")
     height: int = Field(224, ge=32, le=2048, description="input height, pixels")
     width: int = Field(224, ge=32, le=2048, description="input width, pixels")
-    backend: Literal["auto", "torch"] = Field("auto", description="what executes the network: auto or torch")
+    backend: Literal["auto", "torch"] = Field("auto", description="what executes the network")
 
     @model_validator(mode="before")
     @classmethod
     def _default_layer(cls, values: Any) -> Any:
-        """Without a layer: the middle one of the embedded network, the paper's conv5 of the others."""
+        """Without a layer: the only or the best one of networks that have no conv5, the paper's conv5 of the others."""
         if isinstance(values, dict) and not values.get("layer"):
-            embedded = str(values.get("backbone", EMBEDDED)).startswith(EMBEDDED)
-            return values | {"layer": "s16" if embedded else "conv5"}
+            return values | {"layer": _LAYERS.get(str(values.get("backbone", EMBEDDED)), "conv5")}
         return values
 
 
@@ -108,11 +107,28 @@ class Sequence(Section):
     direction: Literal["forward", "both"] = Field("forward", description="'both' also finds a street driven back")
 
 
+class SeqSlam(Section):
+    """Thumbnails of the method `seqslam`."""
+
+    width: int = Field(64, ge=8, le=1024, description="thumbnail width, pixels, a multiple of 8")
+    height: int = Field(32, ge=8, le=1024, description="thumbnail height, pixels, a multiple of 8")
+    faithful: bool = Field(False, description="OpenSeqSLAM's own thumbnails and local contrast instead of better ones")
+
+
+class Onnx(Section):
+    """The user's own network, for the method `onnx` and the backbone of that name."""
+
+    path: str = Field("", description="file NETWORK.onnx, with NETWORK.json beside it")
+
+
 class Decide(Section):
     """From the best score to a decision."""
 
     threshold: float | None = Field(
         None, description="least score of a loop, where a score is a similarity 1 - D; none = the method's own"
+    )
+    consistency: int = Field(
+        10, ge=1, description="frames over which the best candidate must have moved on with the robot; 1 = not asked"
     )
 
 
@@ -137,6 +153,20 @@ class Config(Section):
     learning: Learning = Learning()
     sequence: Sequence = Sequence()
     decision: Decide = Decide()
+    seqslam: SeqSlam = SeqSlam()
+    onnx: Onnx = Onnx()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _what_the_name_says(cls, values: Any) -> Any:
+        """Fill in what the method's name says, where nothing else is given."""
+        method = str(values.get("method")) if isinstance(values, dict) else ""
+        for name, value in METHOD_SETTINGS.get(method, {}).items():
+            section, _, field = name.partition(".")
+            given = values.get(section, {})
+            if isinstance(given, dict):
+                values = values | {section: {field: value, **given}}
+        return values
 
     @classmethod
     def preset(cls, name: str) -> Config:
@@ -164,7 +194,8 @@ class Config(Section):
 
         Text is converted to the type of the field. Setting one of ``compression.gamma``, ``.energy`` and
         ``.components`` clears the other two, because only one of them can rule; setting ``features.backbone`` alone
-        chooses that network's default layer.
+        chooses that network's default layer; setting ``method`` also sets what its name says (`METHOD_SETTINGS`), where
+        that is not given too.
 
         Raises
         ------
@@ -173,6 +204,7 @@ class Config(Section):
         """
         known = field_names()
         values = self.model_dump()
+        settings = METHOD_SETTINGS.get(str(settings.get("method")), {}) | dict(settings)
         if "features.backbone" in settings:
             values["features"]["layer"] = None
         if any(settings.get(f"compression.{rule}") not in (None, "none") for rule in _RULES):
@@ -190,6 +222,7 @@ class Config(Section):
 
 
 _RULES = ("gamma", "energy", "components")
+_LAYERS = {EMBEDDED: "s16", "fasterrcnn_resnet50_fpn": "fpn", "onnx": "output"}
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -201,9 +234,22 @@ PRESETS: dict[str, dict[str, Any]] = {
         "aggregation.centre_window": 0,
         "sequence.length": 10,
         "decision.threshold": 0.7,
+        "decision.consistency": 1,
     },
 }
 """Named configurations: settings over the defaults."""
+
+METHOD_SETTINGS: dict[str, dict[str, Any]] = {
+    "netvlad-resnet152": {"features.backbone": "resnet152", "compression.reading": "none"},
+    "netvlad-vgg16": {"features.backbone": "vgg16", "compression.reading": "none"},
+    "faster-rcnn": {
+        "features.backbone": "fasterrcnn_resnet50_fpn",
+        "features.height": 480,
+        "features.width": 640,
+    },
+    "onnx": {"features.backbone": "onnx"},
+}
+"""What the name of a method says: settings over the defaults, under those that are given."""
 
 
 def field_names() -> list[str]:

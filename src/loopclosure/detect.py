@@ -18,6 +18,7 @@ from loopclosure.config import Config
 from loopclosure.errors import FitError, ModelError
 from loopclosure.images.ahead import read_ahead
 from loopclosure.images.decode import check_image
+from loopclosure.matching.consistency import Consistency
 from loopclosure.methods import Method, PlaceMap, build_method
 from loopclosure.records import Decision, Reason
 from loopclosure.warmup import WarmUp
@@ -167,15 +168,21 @@ class LoopDetector:
         return scores
 
     def _decide(self, query: int, *, readable: bool) -> Decision:
-        if not readable:
-            return _no_candidate(query, Reason.UNREADABLE)
-        if np.isnan(self.scores).all():
-            old_enough = not self.one_stream or query >= self.config.sequence.exclude_recent
-            return _no_candidate(query, Reason.SEQUENCE_TOO_SHORT if old_enough else Reason.TOO_RECENT)
-        match = int(np.nanargmax(self.scores))
+        candidates = readable and not np.isnan(self.scores).all()
+        match = int(np.nanargmax(self.scores)) if candidates else None
+        run = self._consistency.push(match)
+        if match is None:
+            return _no_candidate(query, self._why_none(query) if readable else Reason.UNREADABLE)
         score = float(self.scores[match])
-        accepted = score >= self.threshold
-        return Decision(query, match, score, accepted, None, Reason.ACCEPTED if accepted else Reason.BELOW_THRESHOLD)
+        if score < self.threshold:
+            reason = Reason.BELOW_THRESHOLD
+        else:
+            reason = Reason.ACCEPTED if run >= self.config.decision.consistency else Reason.INCONSISTENT
+        return Decision(query, match, score, reason is Reason.ACCEPTED, None, reason)
+
+    def _why_none(self, query: int) -> Reason:
+        old_enough = not self.one_stream or query >= self.config.sequence.exclude_recent
+        return Reason.SEQUENCE_TOO_SHORT if old_enough else Reason.TOO_RECENT
 
     def set_reference(self, images: Frames, *, progress: Progress | None = None) -> None:
         """Look for loops against another traverse, and no longer within the drive.
@@ -262,6 +269,7 @@ class LoopDetector:
         self._mean = RunningMean(window, prior=prior)
         self._recent: deque[np.ndarray] = deque(maxlen=self.method.window)
         self._sequences = self.method.new_scores(exclude_recent=exclude)
+        self._consistency = Consistency(both_directions=self.config.sequence.direction == "both")
 
     def _against(self, places: PlaceMap, *, prior: np.ndarray | None) -> None:
         if not self.method.fitted or not len(places):
@@ -277,7 +285,9 @@ class LoopDetector:
             with self._timed("learn"):
                 self.method.fit(warm_up.readable)
             self.learned_on.append(f"frames 0 to {len(warm_up.kept) - 1} of the drive")
+            consistency = self._consistency  # what was decided stays decided
             self._begin(prior=self._mean_descriptor(warm_up.readable) if self.method.centred else None)
+            self._consistency = consistency
             for item in warm_up.kept[:-1]:
                 self._step(item)
         if warm_up.finished:
@@ -321,6 +331,7 @@ class LoopDetector:
             "map": self._map.to_arrays(),
             "mean": self._mean.to_arrays(),
             "sequences": self._sequences.to_arrays(),
+            "consistency": self._consistency.to_arrays(),
             "recent": {f"{i:06}": features for i, features in enumerate(self._recent)},
             "warm_up": self._warm_up.to_arrays() if self._warm_up else {},
         }
@@ -353,6 +364,7 @@ class LoopDetector:
         detector._map.restore(store.part(arrays, "map"))
         detector._mean = RunningMean.from_arrays(store.part(arrays, "mean"), window=header["centre_window"])
         detector._sequences.restore(store.part(arrays, "sequences"))
+        detector._consistency.restore(store.part(arrays, "consistency"))
         detector._recent.extend(features for _, features in sorted(store.part(arrays, "recent").items()))
         detector._warm_up = None
         if header["warming_up"]:

@@ -20,6 +20,8 @@ class Reason(str, Enum):
     """Every earlier frame is nearer than ``exclude_recent``: nothing can be a loop yet."""
     BELOW_THRESHOLD = "below_threshold"
     """There is a best candidate, but it is not similar enough."""
+    INCONSISTENT = "inconsistent"
+    """The candidate is similar enough, but the best candidates of the frames before do not lead up to it."""
     SEQUENCE_TOO_SHORT = "sequence_too_short"
     """Fewer frames than one sequence stand behind this frame, or behind every candidate."""
     NOT_VERIFIED = "not_verified"

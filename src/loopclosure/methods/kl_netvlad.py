@@ -11,7 +11,7 @@ from loopclosure.aggregation.netvlad import NetVLAD, unit
 from loopclosure.compression import READINGS, ChannelKL, FlatKL, SequenceKL
 from loopclosure.config import Config
 from loopclosure.errors import FitError
-from loopclosure.features.backbones import Backbone
+from loopclosure.features.networks import open_network
 from loopclosure.matching.similarity import SetMap, VectorMap
 from loopclosure.methods.base import Method
 from loopclosure.store import part
@@ -41,19 +41,11 @@ class KLNetVLAD(Method):
 
     fitted = False
     centred = True
-    threshold = 0.6
+    threshold = 0.56
 
     def __init__(self, config: Config, *, progress: Callable[[int, int], None] | None = None) -> None:
         super().__init__(config)
-        features = config.features
-        self.backbone = Backbone(
-            features.backbone,
-            features.layer,
-            weights=features.weights,
-            height=features.height,
-            width=features.width,
-            progress=progress,
-        )
+        self.backbone = open_network(config, progress=progress)
         self._reading = config.compression.reading
         self._rule = config.compression.model_dump(exclude={"reading"})
         self._kl: ChannelKL | FlatKL | SequenceKL | None = None

@@ -13,8 +13,8 @@ import loopclosure
 
 SOURCE = Path(loopclosure.__file__).parent
 STAGES = ("images", "features", "compression", "aggregation", "matching", "verification")
-SHARED = {"records", "errors", "config", "weights", "store"}
-ABOVE = {"detect", "warmup", "runs", "methods", "training", "evaluation", "report", "placemap", "service", "cli"}
+SHARED = {"records", "errors", "config", "weights", "store", "timing"}
+ABOVE = {"detect", "traverse", "warmup", "runs", "methods", "training", "evaluation", "report", "placemap", "service", "cli"}
 
 
 def test_import_loads_no_stage_and_changes_nothing():

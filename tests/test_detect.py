@@ -150,6 +150,20 @@ def test_saved_detector_goes_on_as_if_it_had_never_stopped(two_laps, tmp_path, s
     assert again.learned_on == detector.learned_on
 
 
+def test_saved_detector_with_a_reference_goes_on(tmp_path):
+    query = make_lap(24, offset=3)
+    detector = LoopDetector(small(aggregation__centre_window=5))
+    detector.set_reference(make_lap(24))
+    for image in query[:12]:
+        detector.add(image)
+    again = LoopDetector.load(detector.save(tmp_path / "saved"))
+    assert not again.one_stream
+    for image in query[12:]:
+        one, two = detector.add(image), again.add(image)
+        assert (one.query, one.match, one.reason) == (two.query, two.match, two.reason)
+        assert one.score == pytest.approx(two.score, abs=1e-5)
+
+
 def test_a_saved_map_serves_as_reference(tmp_path):
     morning = LoopDetector(small())
     for image in make_lap(24):
@@ -188,7 +202,7 @@ def test_map_holds_only_descriptors_of_the_reference():
 def test_errors_towards_users():
     with pytest.raises(FitError, match="nothing was fitted yet"):
         LoopDetector(small()).save_model("nowhere")
-    with pytest.raises(FitError, match="reference is empty"):
+    with pytest.raises(FitError, match="map is empty"):
         LoopDetector(small()).use_map_as_reference()
     with pytest.raises(ImageError):
         LoopDetector(small()).add(np.zeros((64, 64), np.uint8))

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import os
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from loopclosure import store
-from loopclosure.aggregation.centring import RunningMean, centre_traverse
 from loopclosure.config import Config
 from loopclosure.errors import FitError, ModelError
 from loopclosure.images.ahead import read_ahead
 from loopclosure.images.decode import check_image
-from loopclosure.matching.consistency import Consistency
 from loopclosure.methods import Method, PlaceMap, build_method
 from loopclosure.records import Decision, Reason
+from loopclosure.timing import Stopwatch
+from loopclosure.traverse import Traverse, describe, describe_traverse
 from loopclosure.warmup import WarmUp
 
 Progress = Callable[[int, int], None]
@@ -61,8 +59,6 @@ class LoopDetector:
         Sequence score of the last frame to each frame of the map; NaN where that is no candidate.
     learned_on : list of str
         What the method was fitted on, in order.
-    seconds : dict of str to float
-        Time spent so far in each stage.
 
     Raises
     ------
@@ -89,19 +85,23 @@ class LoopDetector:
         self.config = _agreed_config(config, header)
         self.method: Method = build_method(self.config, progress=progress)
         self.learned_on: list[str] = []
-        self.seconds = dict.fromkeys(("features", "learn", "describe", "match"), 0.0)
+        self._clock = Stopwatch("features", "learn", "describe", "match")
         if header is not None:
             self._restore_method(header, arrays)
         self.frames = 0
         self.scores = np.zeros(0, np.float32)
-        self._reference_frames: int | None = None
         self._warm_up = None if self.method.fitted else WarmUp(self.config)
-        self._begin(prior=None)
+        self._traverse = self._new_traverse()
 
     @property
     def one_stream(self) -> bool:
         """Whether candidates come from the drive itself, not from a reference traverse."""
-        return self._reference_frames is None
+        return self._traverse.one_stream
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Time spent so far in each stage."""
+        return self._clock.seconds
 
     @property
     def threshold(self) -> float:
@@ -112,12 +112,12 @@ class LoopDetector:
     @property
     def map_size(self) -> int:
         """Frames that the map holds."""
-        return len(self._map)
+        return len(self._traverse.places)
 
     @property
     def map_bytes(self) -> int:
         """Bytes that the descriptors of the map take."""
-        return self._map.nbytes
+        return self._traverse.places.nbytes
 
     def add(self, image: np.ndarray | None) -> Decision:
         """Take the next frame and decide.
@@ -146,7 +146,7 @@ class LoopDetector:
         if not self.method.fitted:
             self.scores = np.full(query, np.nan, np.float32)
             return _no_candidate(query, Reason.UNREADABLE if image is None else Reason.WARMING_UP)
-        self.scores = self._step(features)
+        self.scores = self._traverse.step(features)
         return self._decide(query, readable=image is not None)
 
     def detect(self, images: Iterable[np.ndarray | None]) -> Iterator[Decision]:
@@ -154,23 +154,10 @@ class LoopDetector:
         for image in read_ahead(images):
             yield self.add(image)
 
-    def _step(self, features: np.ndarray | None) -> np.ndarray:
-        """Do the method: describe, take out what recent frames share, compare, sum over the sequence, remember."""
-        with self._timed("describe"):
-            descriptor = self._describe(features, self._recent)
-            if self.method.centred:
-                descriptor = self._mean.centre(descriptor)
-        with self._timed("match"):
-            similarities = self._map.similarities(descriptor)
-            scores = self._sequences.push(similarities)
-            if self.one_stream:
-                self._map.add(descriptor)
-        return scores
-
     def _decide(self, query: int, *, readable: bool) -> Decision:
         candidates = readable and not np.isnan(self.scores).all()
         match = int(np.nanargmax(self.scores)) if candidates else None
-        run = self._consistency.push(match)
+        run = self._traverse.consistency.push(match)
         if match is None:
             return _no_candidate(query, self._why_none(query) if readable else Reason.UNREADABLE)
         score = float(self.scores[match])
@@ -200,13 +187,12 @@ class LoopDetector:
         described = []
         for index, image in enumerate(read_ahead(images)):
             features = seen[index] if index in seen else self._features(image)
-            described.append(self._describe(features, recent))
+            described.append(describe(self.method, features, recent))
             if progress:
                 progress(index + 1, len(images))
-        mean, descriptors = None, iter(described)
-        if self.method.centred:
-            centred, mean = centre_traverse(np.stack(described), window=self._centre_window)
-            descriptors = iter(centred)
+        if not described:
+            raise FitError("the reference traverse holds no frame")
+        descriptors, mean = describe_traverse(self.method, self.config, described)
         places = self.method.new_map(exclude_recent=0)
         for descriptor in descriptors:
             places.add(descriptor)
@@ -221,8 +207,10 @@ class LoopDetector:
             Settings from here on; those that the map was made with must not differ.
         """
         self.config = _agreed_config(config, self._header())
-        places = self.method.new_map(exclude_recent=0).restore(self._map.to_arrays())
-        self._against(places, prior=self._mean.current)
+        if not self.map_size:
+            raise FitError("the map is empty: add frames before it can serve as a reference")
+        places = self.method.new_map(exclude_recent=0).restore(self._traverse.places.to_arrays())
+        self._against(places, prior=self._traverse.mean)
 
     def fit(self, images: Frames, *, source: str, progress: Progress | None = None) -> None:
         """Fit the method on a traverse, in place of learning from the drive.
@@ -238,65 +226,35 @@ class LoopDetector:
         """
         self._fit_on(images, source=source, progress=progress)
         self._warm_up = None
-        self._begin(prior=None)
+        self._traverse = self._new_traverse()
 
     def _features(self, image: np.ndarray | None) -> np.ndarray | None:
-        with self._timed("features"):
+        with self._clock("features"):
             return None if image is None else self.method.features([check_image(image)])[0]
 
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.seconds[stage] += time.perf_counter() - start
-
-    def _describe(self, features: np.ndarray | None, recent: deque[np.ndarray]) -> Any:
-        if features is None:
-            return self.method.blank()
-        recent.append(features)
-        return self.method.describe(list(recent))
-
-    @property
-    def _centre_window(self) -> int:
-        return self.config.aggregation.centre_window if self.method.centred else 0
-
-    def _begin(self, *, prior: np.ndarray | None, reference: PlaceMap | None = None) -> None:
-        """Start a traverse: nothing behind it but the reference."""
-        window, exclude = self._centre_window, self.config.sequence.exclude_recent if self.one_stream else 0
-        if window and reference is not None:
-            window = max(window, len(reference))  # a whole traverse is compared with a whole traverse
-        self._map = self.method.new_map(exclude_recent=exclude) if reference is None else reference
-        self._mean = RunningMean(window, prior=prior)
-        self._recent: deque[np.ndarray] = deque(maxlen=self.method.window)
-        self._sequences = self.method.new_scores(exclude_recent=exclude)
-        self._consistency = Consistency(both_directions=self.config.sequence.direction == "both")
+    def _new_traverse(self, *, reference: PlaceMap | None = None, prior: np.ndarray | None = None) -> Traverse:
+        return Traverse(self.method, self.config, clock=self._clock, reference=reference, prior=prior)
 
     def _against(self, places: PlaceMap, *, prior: np.ndarray | None) -> None:
-        if not self.method.fitted or not len(places):
-            raise FitError("the reference is empty: add frames or set a reference traverse first")
         self._warm_up = None
-        self._reference_frames = len(places)
         self.frames = 0
-        self._begin(prior=prior, reference=places)
+        self._traverse = self._new_traverse(reference=places, prior=prior)
 
     def _learn(self, warm_up: WarmUp, features: np.ndarray | None) -> None:
         """At a milestone of the warm-up, fit on the frames so far and go through them again, from their features."""
         if warm_up.push(features):
-            with self._timed("learn"):
+            with self._clock("learn"):
                 self.method.fit(warm_up.readable)
             self.learned_on.append(f"frames 0 to {len(warm_up.kept) - 1} of the drive")
-            consistency = self._consistency  # what was decided stays decided
-            self._begin(prior=self._mean_descriptor(warm_up.readable) if self.method.centred else None)
-            self._consistency = consistency
+            recent: deque[np.ndarray] = deque(maxlen=self.method.window)
+            described = [describe(self.method, item, recent) for item in warm_up.readable]
+            before = self._traverse
+            self._traverse = self._new_traverse(prior=describe_traverse(self.method, self.config, described)[1])
+            self._traverse.consistency = before.consistency  # what was decided stays decided
             for item in warm_up.kept[:-1]:
-                self._step(item)
+                self._traverse.step(item)
         if warm_up.finished:
             self._warm_up = None
-
-    def _mean_descriptor(self, features: list[np.ndarray]) -> np.ndarray | None:
-        recent: deque[np.ndarray] = deque(maxlen=self.method.window)
-        described = np.stack([self._describe(item, recent) for item in features])
-        return centre_traverse(described, window=self._centre_window)[1]
 
     def _fit_on(self, images: Frames, *, source: str, progress: Progress | None) -> dict[int, np.ndarray]:
         """Fit the method on evenly spaced frames and return the features of these, by index."""
@@ -313,7 +271,7 @@ class LoopDetector:
                 seen[index] = features
             if progress:
                 progress(index + 1, len(images))
-        with self._timed("learn"):
+        with self._clock("learn"):
             self.method.fit(list(seen.values()) or [first])
         self.learned_on = [f"{len(seen)} of {len(images)} frames of the {source}"]
         return seen
@@ -328,21 +286,16 @@ class LoopDetector:
         """Write the whole detector; `load` brings it back as if it had never stopped."""
         parts = {
             "method": self.method.to_arrays() if self.method.fitted else {},
-            "map": self._map.to_arrays(),
-            "mean": self._mean.to_arrays(),
-            "sequences": self._sequences.to_arrays(),
-            "consistency": self._consistency.to_arrays(),
-            "recent": {f"{i:06}": features for i, features in enumerate(self._recent)},
+            "traverse": self._traverse.to_arrays(),
             "warm_up": self._warm_up.to_arrays() if self._warm_up else {},
         }
         header = self._header() | {
             "frames": self.frames,
-            "reference_frames": self._reference_frames,
-            "centre_window": self._mean.window,
+            "one_stream": self.one_stream,
             "fitted": self.method.fitted,
             "warming_up": self._warm_up is not None,
         }
-        arrays = {f"{part}.{name}": array for part, items in parts.items() for name, array in items.items()}
+        arrays = {f"{name}.{key}": array for name, items in parts.items() for key, array in items.items()}
         return store.save_arrays(folder, kind="detector", header=header, arrays=arrays)
 
     @classmethod
@@ -359,13 +312,11 @@ class LoopDetector:
         if header["fitted"]:
             detector._restore_method(header, store.part(arrays, "method"))
         detector.frames = header["frames"]
-        detector._reference_frames = header["reference_frames"]
-        detector._begin(prior=None)
-        detector._map.restore(store.part(arrays, "map"))
-        detector._mean = RunningMean.from_arrays(store.part(arrays, "mean"), window=header["centre_window"])
-        detector._sequences.restore(store.part(arrays, "sequences"))
-        detector._consistency.restore(store.part(arrays, "consistency"))
-        detector._recent.extend(features for _, features in sorted(store.part(arrays, "recent").items()))
+        state = store.part(arrays, "traverse")
+        reference = None
+        if not header["one_stream"]:
+            reference = detector.method.new_map(exclude_recent=0)
+        detector._traverse = detector._new_traverse(reference=reference).restore(state)
         detector._warm_up = None
         if header["warming_up"]:
             detector._warm_up = WarmUp(detector.config).restore(store.part(arrays, "warm_up"))

@@ -62,6 +62,6 @@ def test_state_comes_back():
     running = RunningMean(30, prior=np.zeros(8, np.float32))
     for descriptor in descriptors[:60]:
         running.centre(descriptor)
-    again = RunningMean.from_arrays(running.to_arrays(), window=30)
+    again = RunningMean.from_arrays(running.to_arrays())
     for descriptor in descriptors[60:]:
         np.testing.assert_allclose(again.centre(descriptor), running.centre(descriptor), atol=1e-6)

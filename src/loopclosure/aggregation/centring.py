@@ -96,13 +96,13 @@ class RunningMean:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the state, for `loopclosure.store`."""
-        arrays = {} if self.prior is None else {"prior": self.prior}
+        arrays = {"window": np.array(self.window)} | ({} if self.prior is None else {"prior": self.prior})
         return arrays | ({"recent": np.stack(self._recent)} if self._recent else {})
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray], *, window: int) -> RunningMean:
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> RunningMean:
         """Rebuild the state that `to_arrays` gave."""
-        mean = cls(window, prior=arrays.get("prior"))
+        mean = cls(int(arrays["window"]), prior=arrays.get("prior"))
         for descriptor in arrays.get("recent", ()):
             mean.centre(descriptor)
         return mean

@@ -90,7 +90,8 @@ def closed_port() -> int:
 def test_table_is_torchvisions() -> None:
     from torchvision.models import get_model_weights
 
-    ours = {name for name, row in WEIGHTS.items() if row.url and "pytorch.org" in row.url}
+    # The detector of regions takes an image of any size and is checked by its address below.
+    ours = {name for name, row in WEIGHTS.items() if row.url and "pytorch.org" in row.url} - {"fasterrcnn-coco"}
     for backbone in sorted({WEIGHTS[name].backbone for name in ours}):
         for theirs in get_model_weights(backbone):
             name = f"{backbone}-{theirs.name.lower().replace('_', '-')}"

@@ -115,6 +115,16 @@ class SeqSlam(Section):
     faithful: bool = Field(False, description="OpenSeqSLAM's own thumbnails and local contrast instead of better ones")
 
 
+class Words(Section):
+    """Local features and visual words of the methods `fabmap`, `bow` and `bow-incremental`."""
+
+    keypoints: Literal["rootsift", "orb"] = Field("rootsift", description="what detects and describes local features")
+    max_features: int = Field(1000, ge=1, le=20_000, description="at most so many features an image")
+    side: int = Field(640, ge=32, le=4096, description="longer side to which an image is scaled first, pixels")
+    branching: int = Field(100, ge=2, le=10_000, description="clusters of each node of the vocabulary tree")
+    levels: int = Field(2, ge=1, le=8, description="depth of the tree: up to branching ** levels words")
+
+
 class Onnx(Section):
     """The user's own network, for the method `onnx` and the backbone of that name."""
 
@@ -154,6 +164,7 @@ class Config(Section):
     sequence: Sequence = Sequence()
     decision: Decide = Decide()
     seqslam: SeqSlam = SeqSlam()
+    words: Words = Words()
     onnx: Onnx = Onnx()
 
     @model_validator(mode="before")

@@ -346,10 +346,11 @@ def _agreed_config(config: Config | None, header: Mapping[str, Any] | None) -> C
     if config is None:
         return fitted
     wanted, found = config.flat(), fitted.flat()
-    binding = [name for name in wanted if name.startswith(("features.", "compression.")) and name != "features.backend"]
+    free = ("images.", "learning.", "sequence.", "decision.", "features.backend", "aggregation.centre_window")
+    binding = [name for name in wanted if not name.startswith(free)]
     if fitted.compression.reading == "sequence":
         binding.append("sequence.length")
-    for name in ("method", *binding, "aggregation.clusters"):
+    for name in binding:
         if wanted[name] != found[name]:
             raise ModelError(
                 f"the model was fitted with {name} = {found[name]}, wanted {wanted[name]}; "

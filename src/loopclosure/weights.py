@@ -163,6 +163,17 @@ _TABLE = (
     _torchvision("googlenet", "v1", "googlenet-1378be20.pth",
                  "1378be20a8e875cf1568b8a71654e704449655e34711a959a38b04fb34905cef", 49.731, _SZEGEDY,
                  mean=(0.5,) * 3, std=(0.5,) * 3),
+    Weights(
+        name="fasterrcnn-coco",
+        backbone="fasterrcnn_resnet50_fpn",
+        sha256="258fb6c6",
+        size_mb=159.743,
+        licence="BSD-3-Clause",
+        source="COCO; torchvision's COCO_V1; Ren et al. 2015, arXiv:1506.01497",
+        url="https://download.pytorch.org/models/fasterrcnn_resnet50_fpn_coco-258fb6c6.pth",
+        height=480,
+        width=640,
+    ),
     _places365("alexnet", None, 223.4),
     _places365("resnet18", "2f4759217d470da2b803f8f66cd4488a066406b555a5fb95ee9a4663f9f05588", 43.398),
     _places365("resnet50", "46529c86902bd0cfb0ea562a30b2850c28d2620d96282b3db9c318e1d774f6c5", 92.8),
@@ -182,6 +193,7 @@ DEFAULTS: dict[str, str] = {
     "vgg16": "vgg16-imagenet1k-v1",
     "alexnet": "alexnet-imagenet1k-v1",
     "googlenet": "googlenet-imagenet1k-v1",
+    "fasterrcnn_resnet50_fpn": "fasterrcnn-coco",
 }
 """What ``"default"`` means for each backbone."""
 

@@ -33,4 +33,4 @@ def main() -> None:
         sys.exit(130)
 
 
-from loopclosure.cli import compare, datasets, detect, evaluate, fit, simulate, tables  # noqa: E402, F401  (they register their commands)
+from loopclosure.cli import compare, datasets, detect, evaluate, fit, reproduce, simulate, tables  # noqa: E402, F401  (they register their commands)

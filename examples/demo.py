@@ -26,8 +26,7 @@ def main():
     parser.add_argument("--covered", type=float, default=0.25, help="share of the view behind people and cars")
     options = parser.parse_args()
     drive = options.out / "drive"
-    if (drive / "settings.json").exists():  # of an earlier demo
-        shutil.rmtree(drive)
+    shutil.rmtree(drive, ignore_errors=True)  # of an earlier demo
 
     with progress_bars(quiet=not sys.stderr.isatty()) as progress:
         settings = SimulationSettings(frames=options.frames, covered=options.covered)
@@ -41,8 +40,11 @@ def main():
     poses = np.loadtxt(drive / "poses.csv", delimiter=",", skiprows=1)[:, 1:3]
     page = write_report(run, metrics=metrics, curve=curve, truth=truth, poses=poses, title="A simulated street drive")
 
-    print(f"{metrics['accepted']} loops accepted in {metrics['rows']} frames; {metrics['rows_with_truth']} are revisits")
-    print(f"precision {metrics['precision']:.3f}, recall {metrics['recall']:.3f} at the shipped threshold")
+    print(
+        f"{metrics['accepted']} loops accepted in {metrics['rows']} frames; {metrics['rows_with_truth']} are revisits"
+    )
+    precision, recall = ("undefined" if metrics[k] is None else f"{metrics[k]:.3f}" for k in ("precision", "recall"))
+    print(f"precision {precision}, recall {recall} at the shipped threshold")
     print(f"look at {page}")
 
 

@@ -33,12 +33,26 @@ def test_paper_preset_is_the_papers_table():
         ({"compression.gamma": None}, "exactly one of gamma, energy and components"),
         ({"compression.gamma": 0.5, "compression.energy": 0.5}, "found "),
         ({"compression.reading": "sequence", "compression.energy": 0.5}, "wants gamma or components"),
+        ({"compression.reading": "sequence", "sequence.direction": "both"}, "wants another reading"),
     ],
 )
 def test_wrong_settings_are_one_line_errors(settings, message):
     with pytest.raises(ConfigError, match=message) as caught:
         Config().with_settings(settings)
     assert "\n" not in str(caught.value)
+
+
+def test_wrong_values_in_python_are_our_errors_too():
+    with pytest.raises(ConfigError, match=r"sequence\.length = 0"):
+        Config(sequence={"length": 0})
+    with pytest.raises(ConfigError, match="unknown setting 'sequense', did you mean"):
+        Config(sequense={})
+
+
+def test_a_threshold_belongs_to_one_method():
+    paper = Config.preset("paper")
+    assert paper.with_settings({"method": "seqslam"}).decision.threshold is None
+    assert paper.with_settings({"method": "kl-netvlad"}).decision.threshold == 0.7
 
 
 def test_text_is_converted():

@@ -131,8 +131,60 @@ def test_blank_frames_give_no_nan(value):
 
 
 def test_frames_of_mixed_sizes_are_allowed(two_laps):
-    mixed = [image if i % 2 else np.repeat(image, 2, axis=1) for i, image in enumerate(two_laps)]
-    assert len(list(LoopDetector(small()).detect(mixed))) == 48
+    mixed = [image if i % 2 else image.repeat(2, axis=0).repeat(2, axis=1) for i, image in enumerate(two_laps)]
+    decisions = list(LoopDetector(small()).detect(mixed))
+    assert [d.match for d in decisions[30:]] == list(range(6, 24))
+
+
+def test_a_drive_that_begins_in_the_dark_still_learns_from_enough_frames(two_laps):
+    detector = LoopDetector(small())
+    decisions = list(detector.detect([*[None] * 12, *two_laps]))
+    assert [d.reason for d in decisions[:12]] == [Reason.UNREADABLE] * 12
+    assert decisions[20].reason is Reason.WARMING_UP
+    assert detector.learned_on[0] == "frames 0 to 21 of the drive, 12 of them unreadable"
+    assert [d.match for d in decisions[-10:]] == list(range(26, 36))
+
+
+def test_a_small_exclusion_band_does_not_mean_a_small_fit(two_laps):
+    detector = LoopDetector(small(sequence__exclude_recent=1))
+    list(detector.detect(two_laps[:12]))
+    assert detector.learned_on == ["frames 0 to 9 of the drive"]
+
+
+def test_a_model_knows_the_first_places_of_a_drive_as_well(two_laps):
+    detector = LoopDetector(small(sequence__length=1))
+    detector.fit(make_lap(24), source="lap")
+    decisions = list(detector.detect(two_laps))
+    assert [d.match for d in decisions[24:28]] == [0, 1, 2, 3]
+
+
+def test_fitting_begins_a_new_drive(two_laps):
+    detector = LoopDetector(small())
+    list(detector.detect(two_laps[:12]))
+    detector.fit(make_lap(24), source="lap")
+    assert (detector.frames, detector.map_size, detector.scores.size) == (0, 0, 0)
+    assert detector.add(two_laps[0]).query == 0
+
+
+def test_unreadable_queries_have_no_scores(two_laps):
+    detector = LoopDetector(small())
+    list(detector.detect([*two_laps[:30], None]))
+    assert detector.scores.size == 30
+    assert np.isnan(detector.scores).all()
+
+
+def test_a_live_source_is_asked_for_one_image_at_a_time(two_laps):
+    taken = []
+
+    def camera():
+        for i, image in enumerate(two_laps):
+            taken.append(i)
+            yield image
+
+    decisions = LoopDetector(small()).detect(camera())
+    for expected in range(5):
+        next(decisions)
+        assert len(taken) == expected + 1
 
 
 @pytest.mark.parametrize("stop", [5, 15, 25, 35])
@@ -173,6 +225,11 @@ def test_a_saved_map_serves_as_reference(tmp_path):
     evening.use_map_as_reference(small(decision__threshold=0.7))
     decisions = list(evening.detect(make_lap(24, offset=3)))
     assert [d.match for d in decisions[3:]] == list(range(3, 24))
+    evening.use_map_as_reference(small(sequence__length=8))
+    decisions = list(evening.detect(make_lap(24, offset=3)))
+    assert [d.match for d in decisions] == [None] * 7 + list(range(7, 24))
+    with pytest.raises(ModelError, match=r"another aggregation\.centre_window"):
+        evening.use_map_as_reference(small(aggregation__centre_window=0))
     with pytest.raises(ModelError, match=r"features\.layer = s16, wanted s8"):
         evening.use_map_as_reference(small(features__layer="s8"))
 

@@ -32,7 +32,14 @@ def test_wrong_kind_and_format(folder):
         load_arrays(folder, kind="model")
 
 
-@pytest.mark.parametrize("text", ["", "not json", "[]", "\u0000", "x" * (MAX_HEADER_BYTES + 1)])
+def test_parts_of_two_savings_do_not_go_together(folder, tmp_path):
+    other = save_arrays(tmp_path / "y", kind="model", header={}, arrays={"m": np.ones(3)})
+    (folder / ARRAYS).write_bytes((other / ARRAYS).read_bytes())
+    with pytest.raises(ModelError, match="do not belong together"):
+        load_arrays(folder, kind="model")
+
+
+@pytest.mark.parametrize("text", ["", "[" * 100_000, "not json", "[]", "\u0000", "x" * (MAX_HEADER_BYTES + 1)])
 def test_damaged_header(folder, text):
     (folder / HEADER).write_text(text)
     with pytest.raises(ModelError):
@@ -41,7 +48,7 @@ def test_damaged_header(folder, text):
 
 def test_damaged_or_missing_arrays(folder):
     (folder / ARRAYS).write_bytes((folder / ARRAYS).read_bytes()[:-8])
-    with pytest.raises(ModelError, match="missing or damaged"):
+    with pytest.raises(ModelError, match="do not belong together"):
         load_arrays(folder, kind="model")
     (folder / ARRAYS).unlink()
     with pytest.raises(ModelError, match="missing or damaged"):

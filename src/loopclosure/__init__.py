@@ -18,7 +18,15 @@ from __future__ import annotations
 
 import importlib
 import logging
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from loopclosure.config import Config as Config
+    from loopclosure.detect import LoopDetector as LoopDetector
+    from loopclosure.errors import LoopClosureError as LoopClosureError
+    from loopclosure.images.sequence import ImageSequence as ImageSequence
+    from loopclosure.records import Decision as Decision
+    from loopclosure.records import Reason as Reason
 
 __version__ = "0.1.0"
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -46,7 +46,6 @@ class Features(Section):
     weights: str = Field("default", description="'default', a name, a path, or 'random'")
     height: int = Field(224, ge=32, le=2048, description="input height, pixels")
     width: int = Field(224, ge=32, le=2048, description="input width, pixels")
-    backend: Literal["auto", "torch"] = Field("auto", description="what executes the network")
 
     @model_validator(mode="before")
     @classmethod
@@ -167,6 +166,20 @@ class Config(Section):
     words: Words = Words()
     onnx: Onnx = Onnx()
 
+    def __init__(self, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise ConfigError(one_line(error, field_names())) from None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Config:
+        if self.sequence.direction == "both" and self.compression.reading == "sequence":
+            raise ValueError(
+                "sequence.direction = both wants another reading than 'sequence': eigen-images have no direction"
+            )
+        return self
+
     @model_validator(mode="before")
     @classmethod
     def _what_the_name_says(cls, values: Any) -> Any:
@@ -216,6 +229,8 @@ class Config(Section):
         known = field_names()
         values = self.model_dump()
         settings = METHOD_SETTINGS.get(str(settings.get("method")), {}) | dict(settings)
+        if settings.get("method", self.method) != self.method:
+            settings = {"decision.threshold": None} | settings  # a threshold holds for the scores of one method
         if "features.backbone" in settings:
             values["features"]["layer"] = None
         if any(settings.get(f"compression.{rule}") not in (None, "none") for rule in _RULES):
@@ -226,10 +241,7 @@ class Config(Section):
             section, _, field = name.rpartition(".")
             target = values[section] if section else values
             target[field] = _parse(name, value)
-        try:
-            return Config.model_validate(values)
-        except ValidationError as error:
-            raise ConfigError(_one_line(error)) from None
+        return Config(**values)
 
 
 _RULES = ("gamma", "energy", "components")
@@ -283,7 +295,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, Any]:
         return _flatten(tomllib.loads(file.read_text(encoding="utf-8")))
     except OSError as error:
         raise ConfigError(f"cannot read the configuration {file}: {error.strerror or error}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{file} is not valid TOML: {error}") from None
 
 
@@ -307,10 +319,13 @@ def _parse(name: str, value: Any) -> Any:
     return value
 
 
-def _one_line(error: ValidationError) -> str:
+def one_line(error: ValidationError, known: Iterable[str] = ()) -> str:
+    """Say what the first problem of a validation is, in one line, with a guess for an unknown name."""
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
     message = str(first["msg"]).removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        return f"unknown setting '{where}'{did_you_mean(where, known)}"
     if first["type"] == "value_error":
-        return f"{where}: {message}"
+        return f"{where}: {message}" if where else message
     return f"{where} = {first.get('input')!r}: {message[0].lower()}{message[1:]}"

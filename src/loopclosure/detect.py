@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from loopclosure import store
 from loopclosure.config import Config
-from loopclosure.errors import FitError, ModelError
+from loopclosure.errors import FitError, LoopClosureError, ModelError
 from loopclosure.images.ahead import read_ahead
 from loopclosure.images.decode import check_image
 from loopclosure.methods import Method, PlaceMap, build_method
@@ -82,16 +82,19 @@ class LoopDetector:
         progress: Progress | None = None,
     ) -> None:
         header, arrays = store.load_arrays(model, kind="model") if model is not None else (None, {})
-        self.config = _agreed_config(config, header)
+        self.config = _agreed_config(config, header, model)
         self.method: Method = build_method(self.config, progress=progress)
         self.learned_on: list[str] = []
         self._clock = Stopwatch("features", "learn", "describe", "match")
+        self.frames: int
+        self.scores: np.ndarray
+        self._traverse: Traverse
+        self._mean: np.ndarray | None = None  # mean descriptor of what the method was fitted on
         if header is not None:
-            self._restore_method(header, arrays)
-        self.frames = 0
-        self.scores = np.zeros(0, np.float32)
+            with store.damaged_is_an_error(model or ""):
+                self._restore_method(header, arrays)
         self._warm_up = None if self.method.fitted else WarmUp(self.config)
-        self._traverse = self._new_traverse()
+        self._start(self._new_traverse(prior=self._mean))
 
     @property
     def one_stream(self) -> bool:
@@ -147,11 +150,16 @@ class LoopDetector:
             self.scores = np.full(query, np.nan, np.float32)
             return _no_candidate(query, Reason.UNREADABLE if image is None else Reason.WARMING_UP)
         self.scores = self._traverse.step(features)
+        if image is None:
+            self.scores = np.full_like(self.scores, np.nan)
         return self._decide(query, readable=image is not None)
 
     def detect(self, images: Iterable[np.ndarray | None]) -> Iterator[Decision]:
-        """Yield the decision of each frame: `add` frame by frame, with decoding running ahead."""
-        for image in read_ahead(images):
+        """Yield the decision of each frame: `add` frame by frame.
+
+        Decoding runs ahead where `images` has a length; a live source is asked for one image at a time.
+        """
+        for image in read_ahead(images) if isinstance(images, Sized) else images:
             yield self.add(image)
 
     def _decide(self, query: int, *, readable: bool) -> Decision:
@@ -206,7 +214,10 @@ class LoopDetector:
         config : Config, optional
             Settings from here on; those that the map was made with must not differ.
         """
-        self.config = _agreed_config(config, self._header())
+        agreed = _agreed_config(config, self._header())
+        if agreed.aggregation.centre_window != self.config.aggregation.centre_window:
+            raise ModelError("the map was made with another aggregation.centre_window; leave that setting out")
+        self.config = self.method.config = agreed
         if not self.map_size:
             raise FitError("the map is empty: add frames before it can serve as a reference")
         places = self.method.new_map(exclude_recent=0).restore(self._traverse.places.to_arrays())
@@ -224,9 +235,10 @@ class LoopDetector:
         progress : callable, optional
             ``progress(done, total)`` in frames.
         """
-        self._fit_on(images, source=source, progress=progress)
+        seen = self._fit_on(images, source=source, progress=progress)
         self._warm_up = None
-        self._traverse = self._new_traverse()
+        self._mean = self._mean_of(list(seen.values()))
+        self._start(self._new_traverse(prior=self._mean))
 
     def _features(self, image: np.ndarray | None) -> np.ndarray | None:
         with self._clock("features"):
@@ -237,19 +249,33 @@ class LoopDetector:
 
     def _against(self, places: PlaceMap, *, prior: np.ndarray | None) -> None:
         self._warm_up = None
+        self._start(self._new_traverse(reference=places, prior=prior))
+
+    def _start(self, traverse: Traverse) -> None:
         self.frames = 0
-        self._traverse = self._new_traverse(reference=places, prior=prior)
+        self.scores = np.zeros(0, np.float32)
+        self._traverse = traverse
+
+    def _mean_of(self, features: list[np.ndarray]) -> np.ndarray | None:
+        recent: deque[np.ndarray] = deque(maxlen=self.method.window)
+        described = [describe(self.method, item, recent) for item in features]
+        return describe_traverse(self.method, self.config, described)[1]
 
     def _learn(self, warm_up: WarmUp, features: np.ndarray | None) -> None:
         """At a milestone of the warm-up, fit on the frames so far and go through them again, from their features."""
         if warm_up.push(features):
-            with self._clock("learn"):
-                self.method.fit(warm_up.readable)
-            self.learned_on.append(f"frames 0 to {len(warm_up.kept) - 1} of the drive")
-            recent: deque[np.ndarray] = deque(maxlen=self.method.window)
-            described = [describe(self.method, item, recent) for item in warm_up.readable]
+            try:
+                with self._clock("learn"):
+                    self.method.fit(warm_up.readable)
+            except LoopClosureError:
+                warm_up.take_back()
+                raise
+            warm_up.fit_done()
+            unreadable = len(warm_up.kept) - len(warm_up.readable)
+            without = f", {unreadable} of them unreadable" if unreadable else ""
+            self.learned_on.append(f"frames 0 to {len(warm_up.kept) - 1} of the drive{without}")
             before = self._traverse
-            self._traverse = self._new_traverse(prior=describe_traverse(self.method, self.config, described)[1])
+            self._traverse = self._new_traverse(prior=self._mean_of(warm_up.readable))
             self._traverse.consistency = before.consistency  # what was decided stays decided
             for item in warm_up.kept[:-1]:
                 self._traverse.step(item)
@@ -265,14 +291,15 @@ class LoopDetector:
         most = max(2, min(learning.fit_frames, int(learning.max_kept_mb * 1e6 / first.nbytes)))
         chosen = _evenly_spaced(len(images), most)
         seen = {}
-        for index, image in zip(chosen, read_ahead(images[i] for i in chosen), strict=True):
+        for index, image in read_ahead(_at(images, chosen)):
             features = self._features(image)
             if features is not None:
                 seen[index] = features
             if progress:
                 progress(index + 1, len(images))
+        seen = seen or {0: first}
         with self._clock("learn"):
-            self.method.fit(list(seen.values()) or [first])
+            self.method.fit(list(seen.values()))
         self.learned_on = [f"{len(seen)} of {len(images)} frames of the {source}"]
         return seen
 
@@ -280,12 +307,12 @@ class LoopDetector:
         """Write what was learned, without the map; ``LoopDetector(model=folder)`` starts with it."""
         if not self.method.fitted:
             raise FitError("nothing was fitted yet: no model to save")
-        return store.save_arrays(folder, kind="model", header=self._header(), arrays=self.method.to_arrays())
+        return store.save_arrays(folder, kind="model", header=self._header(), arrays=self._learned_arrays())
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write the whole detector; `load` brings it back as if it had never stopped."""
         parts = {
-            "method": self.method.to_arrays() if self.method.fitted else {},
+            "method": self._learned_arrays() if self.method.fitted else {},
             "traverse": self._traverse.to_arrays(),
             "warm_up": self._warm_up.to_arrays() if self._warm_up else {},
         }
@@ -308,19 +335,29 @@ class LoopDetector:
             If the folder holds no detector of this format, or its weights are not the ones it was made with.
         """
         header, arrays = store.load_arrays(folder, kind="detector")
+        with store.damaged_is_an_error(folder):
+            return cls._rebuilt(header, arrays, progress)
+
+    @classmethod
+    def _rebuilt(
+        cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], progress: Progress | None
+    ) -> LoopDetector:
         detector = cls(Config.from_dict(header["config"]), progress=progress)
         if header["fitted"]:
             detector._restore_method(header, store.part(arrays, "method"))
-        detector.frames = header["frames"]
         state = store.part(arrays, "traverse")
         reference = None
         if not header["one_stream"]:
             reference = detector.method.new_map(exclude_recent=0)
-        detector._traverse = detector._new_traverse(reference=reference).restore(state)
+        detector._start(detector._new_traverse(reference=reference).restore(state))
+        detector.frames = int(header["frames"])
         detector._warm_up = None
         if header["warming_up"]:
             detector._warm_up = WarmUp(detector.config).restore(store.part(arrays, "warm_up"))
         return detector
+
+    def _learned_arrays(self) -> dict[str, np.ndarray]:
+        return self.method.to_arrays() | ({} if self._mean is None else {"mean": self._mean})
 
     def _header(self) -> dict[str, Any]:
         return {
@@ -335,18 +372,21 @@ class LoopDetector:
                 f"fitted with {header['provenance']}, here are {self.method.provenance}; fetch those weights"
             )
         self.method.restore(arrays)
+        self._mean = arrays.get("mean")
         self.learned_on = list(header["learned_on"])
 
 
-def _agreed_config(config: Config | None, header: Mapping[str, Any] | None) -> Config:
+def _agreed_config(
+    config: Config | None, header: Mapping[str, Any] | None, folder: str | os.PathLike[str] | None = None
+) -> Config:
     """Return the configuration, which must not contradict a model on anything that the model was fitted for."""
     if header is None:
         return config or Config()
-    fitted = Config.from_dict(header["config"])
+    fitted = store.saved_config(header, folder or "the model")
     if config is None:
         return fitted
     wanted, found = config.flat(), fitted.flat()
-    free = ("images.", "learning.", "sequence.", "decision.", "features.backend", "aggregation.centre_window")
+    free = ("images.", "learning.", "sequence.", "decision.", "aggregation.centre_window")
     binding = [name for name in wanted if not name.startswith(free)]
     if fitted.compression.reading == "sequence":
         binding.append("sequence.length")
@@ -365,3 +405,12 @@ def _no_candidate(query: int, reason: Reason) -> Decision:
 
 def _evenly_spaced(count: int, most: int) -> list[int]:
     return sorted({round(position) for position in np.linspace(0, count - 1, min(count, most))})
+
+
+def _at(images: Frames, chosen: list[int]) -> Iterator[tuple[int, np.ndarray | None]]:
+    """Yield the chosen frames; a video is read through once, because a jump in it costs a decoder of its own."""
+    if getattr(images, "is_video", False):
+        wanted = set(chosen)
+        yield from ((index, image) for index, image in enumerate(images) if index in wanted)
+    else:
+        yield from ((index, images[index]) for index in chosen)

@@ -7,10 +7,10 @@ import io
 import json
 import os
 import platform
+import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
@@ -28,7 +28,8 @@ from loopclosure.images.sequence import ImageSequence
 from loopclosure.records import Decision, Reason
 from loopclosure.store import HEADER
 
-RUN, SCORES = "run.json", "scores.npy"
+RUN, SCORES, MODEL = "run.json", "scores.npy", "model"
+_DERIVED = (SCORES, "metrics.json", "precision_recall.png", "report.html")  # of results that are about to be replaced
 _PACKAGES = ("numpy", "opencv-python-headless", "scikit-learn", "torch", "torchvision")
 _THUMBNAIL = 800  # largest side of the score matrix that a run keeps in memory
 
@@ -103,32 +104,36 @@ def detect_loops(
     """
     started = time.perf_counter()
     report = progress or (lambda *_: None)
-    detector, reference_images = _make_detector(reference, config, model, report)
-    images = _open(source, detector.config)
+    images = _open(source, config or Config())
     if len(images) < 2:
         raise ImageError(f"{source} holds one image; a loop needs at least two frames")
-    columns = len(images) if detector.one_stream else detector.map_size
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
+    _forget_earlier_results(folder)
+    detector, reference_images = _make_detector(reference, config, model, report)
+    columns = len(images) if detector.one_stream else detector.map_size
     matrix = _Thumbnail(len(images), columns)
     decisions = []
-    with _score_rows(folder / SCORES, (len(images), columns), wanted=save_scores) as write_row:
+    with _ScoreFile(folder / SCORES, wanted=save_scores) as score_file:
         for decision in detector.detect(images):
             decisions.append(decision)
             matrix.add(decision.query, detector.scores)
-            write_row(decision.query, detector.scores)
+            score_file.add(detector.scores)
             report("finding loops", len(decisions), len(images))
-    if save_detector is not None:
-        detector.save(save_detector)
+        score_file.finish(len(decisions) if detector.one_stream else columns)
+    write_loops(folder / LOOPS_FILE, decisions)
     seconds = detector.seconds | {"total": time.perf_counter() - started}
     info = describe_run(detector, seconds) | {
         "source": str(source),
         "reference": None if reference is None else str(reference),
-        "frames": len(images),
+        "frames": len(decisions),
         "references": None if detector.one_stream else columns,
     }
     write_whole(folder / RUN, json.dumps(info, indent=2) + "\n")
-    write_loops(folder / LOOPS_FILE, decisions)
+    if detector.learned_on:
+        detector.save_model(folder / MODEL)
+    if save_detector is not None:
+        detector.save(save_detector)
     return Run(folder, tuple(decisions), info, matrix.cells, images, images if reference is None else reference_images)
 
 
@@ -192,9 +197,16 @@ def describe_run(detector: LoopDetector, seconds: Mapping[str, float]) -> dict[s
         "threshold": detector.threshold,
         "learned_on": detector.learned_on,
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
-        "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in _PACKAGES},
+        "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
         "machine": {"system": platform.platform(), "processor": platform.processor(), "cores": os.cpu_count()},
     }
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "unknown"
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -228,34 +240,64 @@ def _open(source: str | os.PathLike[str], config: Config) -> ImageSequence:
     return ImageSequence(source, on_error=config.images.on_error, max_megapixels=config.images.max_megapixels)
 
 
+def _forget_earlier_results(folder: Path) -> None:
+    """Remove what an earlier run into the same folder left, so that nothing beside the new results is stale."""
+    for name in _DERIVED:
+        (folder / name).unlink(missing_ok=True)
+    shutil.rmtree(folder / MODEL, ignore_errors=True)
+
+
 class _Thumbnail:
-    """The score matrix at a bounded size: the largest score of each cell."""
+    """The score matrix at a bounded size: the largest score of each cell.
+
+    The length of a video is an estimate, so rows and columns beyond it are dropped here; ``scores.npy`` has them all.
+    """
 
     def __init__(self, rows: int, columns: int) -> None:
         self._step = -(-max(rows, columns) // _THUMBNAIL)
         self.cells = np.full((-(-rows // self._step), -(-columns // self._step)), np.nan, np.float32)
 
     def add(self, row: int, scores: np.ndarray) -> None:
-        if scores.size:
-            largest = np.fmax.reduceat(scores, np.arange(0, scores.size, self._step))
+        if scores.size and row // self._step < len(self.cells):
+            largest = np.fmax.reduceat(scores, np.arange(0, scores.size, self._step))[: self.cells.shape[1]]
             cells = self.cells[row // self._step, : largest.size]
             np.fmax(cells, largest, out=cells)
 
 
-@contextmanager
-def _score_rows(path: Path, shape: tuple[int, int], *, wanted: bool) -> Iterator[Callable[[int, np.ndarray], None]]:
-    """Give a function that writes one row of ``scores.npy``; the file appears when all rows are written."""
-    if not wanted:
-        path.unlink(missing_ok=True)  # of an earlier run into the same folder
-        yield lambda *_: None
-        return
-    part = path.with_name(f"{path.name}.part")
-    file = np.lib.format.open_memmap(part, mode="w+", dtype=np.float32, shape=shape)
+class _ScoreFile:
+    """Writes ``scores.npy`` row by row; the file appears when all rows are there."""
 
-    def write_row(row: int, scores: np.ndarray) -> None:
-        file[row, : scores.size] = scores
-        file[row, scores.size :] = np.nan
+    def __init__(self, path: Path, *, wanted: bool) -> None:
+        self._path, self._wanted = path, wanted
+        self._rows_path, self._part = path.with_name(f"{path.name}.rows"), path.with_name(f"{path.name}.part")
+        self._lengths: list[int] = []
 
-    yield write_row
-    file.flush()
-    os.replace(part, path)
+    def __enter__(self) -> _ScoreFile:
+        self._rows = open(self._rows_path, "wb") if self._wanted else None
+        return self
+
+    def add(self, scores: np.ndarray) -> None:
+        """Take the next row; in one stream rows grow."""
+        if self._rows is not None:
+            self._lengths.append(scores.size)
+            self._rows.write(scores.astype(np.float32).tobytes())
+
+    def finish(self, columns: int) -> None:
+        """Put the rows into one matrix, NaN where a row is shorter."""
+        if self._rows is None:
+            return
+        self._rows.flush()
+        shape = (len(self._lengths), columns)
+        matrix = np.lib.format.open_memmap(self._part, mode="w+", dtype=np.float32, shape=shape)
+        with open(self._rows_path, "rb") as rows:
+            for row, length in enumerate(self._lengths):
+                matrix[row, :length] = np.frombuffer(rows.read(4 * length), np.float32)
+                matrix[row, length:] = np.nan
+        matrix.flush()
+        os.replace(self._part, self._path)
+
+    def __exit__(self, *_: object) -> None:
+        if self._rows is not None:
+            self._rows.close()
+        for path in (self._rows_path, self._part):
+            path.unlink(missing_ok=True)

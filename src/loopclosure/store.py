@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
+from loopclosure.config import Config
 from loopclosure.errors import ModelError
+from loopclosure.weights import file_sha256
 
 FORMAT = 1
 HEADER, ARRAYS = "header.json", "arrays.safetensors"
@@ -42,13 +45,34 @@ def save_arrays(
     """
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
-    part = path / f"{ARRAYS}.part"
-    save_file({name: np.asarray(array, order="C") for name, array in arrays.items()}, part)
-    os.replace(part, path / ARRAYS)
-    part = path / f"{HEADER}.part"
-    part.write_text(json.dumps({"format": FORMAT, "kind": kind, **header}, indent=2) + "\n", encoding="utf-8")
-    os.replace(part, path / HEADER)
+    arrays_part, header_part = path / f"{ARRAYS}.part", path / f"{HEADER}.part"
+    save_file({name: np.asarray(array, order="C") for name, array in arrays.items()}, arrays_part)
+    text = {"format": FORMAT, "kind": kind, "arrays_sha256": file_sha256(arrays_part), **header}
+    header_part.write_text(json.dumps(text, indent=2) + "\n", encoding="utf-8")
+    os.replace(arrays_part, path / ARRAYS)
+    os.replace(header_part, path / HEADER)
     return path
+
+
+def load_header(folder: str | os.PathLike[str], *, kind: str) -> dict[str, Any]:
+    """Read the header alone; see `load_arrays`."""
+    path = Path(folder)
+    if not (path / HEADER).is_file():
+        raise ModelError(f"{path} holds no {HEADER}: it is not a folder that loopclosure saved")
+    if (path / HEADER).stat().st_size > MAX_HEADER_BYTES:
+        raise ModelError(f"{path / HEADER} is larger than {MAX_HEADER_BYTES} bytes: it is not ours or is damaged")
+    try:
+        header = json.loads((path / HEADER).read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ModelError(f"{path / HEADER} is not readable JSON: {error}") from None
+    if not isinstance(header, dict) or header.get("kind") != kind:
+        found = header.get("kind") if isinstance(header, dict) else type(header).__name__
+        raise ModelError(f"{path} holds '{found}', wanted '{kind}'")
+    if header.get("format") != FORMAT:
+        raise ModelError(
+            f"{path} has format {header.get('format')}, this version reads format {FORMAT}; make it again with `fit`"
+        )
+    return header
 
 
 def load_arrays(folder: str | os.PathLike[str], *, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -66,28 +90,30 @@ def load_arrays(folder: str | os.PathLike[str], *, kind: str) -> tuple[dict[str,
     ModelError
         If a file is missing or damaged, or holds another kind or another format.
     """
-    path = Path(folder)
-    if not (path / HEADER).is_file():
-        raise ModelError(f"{path} holds no {HEADER}: it is not a folder that loopclosure saved")
-    if (path / HEADER).stat().st_size > MAX_HEADER_BYTES:
-        raise ModelError(f"{path / HEADER} is larger than {MAX_HEADER_BYTES} bytes: it is not ours or is damaged")
+    header, file = load_header(folder, kind=kind), Path(folder) / ARRAYS
     try:
-        header = json.loads((path / HEADER).read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ModelError(f"{path / HEADER} is not readable JSON: {error}") from None
-    if not isinstance(header, dict) or header.get("kind") != kind:
-        found = header.get("kind") if isinstance(header, dict) else type(header).__name__
-        raise ModelError(f"{path} holds '{found}', wanted '{kind}'")
-    if header.get("format") != FORMAT:
-        raise ModelError(
-            f"{path} has format {header.get('format')}, this version reads format {FORMAT}; make it again with `fit`"
-        )
+        if file_sha256(file) != header.get("arrays_sha256"):
+            raise ModelError(f"{file} and its {HEADER} do not belong together: one is damaged, or saving was cut short")
+        return header, load_file(file)
+    except (OSError, SafetensorError, TypeError, AttributeError) as error:
+        raise ModelError(f"{file} is missing or damaged: {error}") from None
+
+
+@contextmanager
+def damaged_is_an_error(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn what a header or arrays of the wrong form set off while an object is rebuilt into a `ModelError`."""
     try:
-        return header, load_file(path / ARRAYS)
-    except (OSError, SafetensorError) as error:
-        raise ModelError(f"{path / ARRAYS} is missing or damaged: {error}") from None
+        yield
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        raise ModelError(f"{folder} is damaged: {type(error).__name__} {error}") from None
 
 
 def part(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
     """Return the arrays whose names begin with ``name.``, without that prefix."""
     return {key.removeprefix(f"{name}."): array for key, array in arrays.items() if key.startswith(f"{name}.")}
+
+
+def saved_config(header: Mapping[str, Any], folder: str | os.PathLike[str]) -> Config:
+    """Return the configuration that a header holds."""
+    with damaged_is_an_error(folder):
+        return Config.from_dict(header["config"])

@@ -108,7 +108,7 @@ def describe(method: Method, features: Features, recent: deque[np.ndarray]) -> A
     return method.describe(list(recent))
 
 
-def describe_traverse(method: Method, config: Config, frames: Sequence[Any]) -> tuple[Sequence[Any], np.ndarray | None]:
+def describe_traverse(method: Method, config: Config, frames: Sequence[Any]) -> tuple[Any, np.ndarray | None]:
     """Take the mean out of the descriptors of a traverse that is known as a whole; return them and the mean."""
     if not method.centred:
         return frames, None

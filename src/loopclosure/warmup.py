@@ -8,12 +8,15 @@ import numpy as np
 
 from loopclosure.config import Config
 
+_FEWEST = 10  # frames of a first fit, however small the exclusion band is
+
 
 class WarmUp:
     """Features of the first frames of a drive, kept until the last fit on them.
 
-    The first fit comes after ``learning.warm_up`` frames (``sequence.exclude_recent`` if that is less), the others at
-    ``learning.refit_at``. What is kept never exceeds ``learning.max_kept_mb``: if it would, the last fit was the last.
+    The first fit comes after ``learning.warm_up`` readable frames (``sequence.exclude_recent`` if that is less, but
+    never fewer than ten), the others at ``learning.refit_at``. A later fit whose features would take more than
+    ``learning.max_kept_mb`` is left out.
 
     Parameters
     ----------
@@ -22,7 +25,7 @@ class WarmUp:
     """
 
     def __init__(self, config: Config) -> None:
-        first = min(config.learning.warm_up, config.sequence.exclude_recent)
+        first = max(_FEWEST, min(config.learning.warm_up, config.sequence.exclude_recent))
         self._milestones = [first, *sorted({count for count in config.learning.refit_at if count > first})]
         self._fits = len(self._milestones)
         self._max_bytes = config.learning.max_kept_mb * 1e6
@@ -31,10 +34,15 @@ class WarmUp:
     def push(self, features: np.ndarray | None) -> bool:
         """Keep the features of a new frame (None if it was unreadable); return whether to fit now."""
         self.kept.append(features)
-        if len(self.kept) < self._milestones[0] or not self.readable:
-            return False
-        self._milestones = [count for count in self._milestones if count > len(self.kept)]
-        return True
+        return features is not None and len(self.readable) >= self._milestones[0]
+
+    def fit_done(self) -> None:
+        """Go on to the next milestone."""
+        self._milestones = self._milestones[1:]
+
+    def take_back(self) -> None:
+        """Forget the last frame."""
+        self.kept.pop()
 
     @property
     def readable(self) -> list[np.ndarray]:

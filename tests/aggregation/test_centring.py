@@ -32,6 +32,14 @@ def test_prior_stands_in_for_missing_frames():
         np.testing.assert_allclose(centred, unit(descriptors[t] - mean), atol=1e-5)
 
 
+def test_a_short_window_lets_go_of_the_prior():
+    running = RunningMean(5, prior=np.full(8, 9.0, np.float32))
+    descriptors = make_descriptors(30)
+    for descriptor in descriptors:
+        running.centre(descriptor)
+    np.testing.assert_allclose(running.current, descriptors[-5:].mean(0), atol=1e-5)
+
+
 def test_blank_frames_do_not_count():
     descriptors = make_descriptors(10)
     with_blanks, without = RunningMean(30), RunningMean(30)

@@ -6,6 +6,7 @@ import csv
 import json
 import sys
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -95,6 +96,37 @@ def test_scores_of_one_stream_are_masked(run, lap, tmp_path):
     assert not (tmp_path / "scores.npy").exists()
 
 
+def test_results_of_an_earlier_run_do_not_stay(run, lap, tmp_path):
+    (tmp_path / "metrics.json").write_text("{}")
+    (tmp_path / "precision_recall.png").write_bytes(b"")
+    assert run("detect", lap, "--out", tmp_path, *FAST)[0] == 0
+    left = {path.name for path in tmp_path.iterdir()}
+    assert {"loops.csv", "run.json", "report.html"} <= left
+    assert not left & {"metrics.json", "precision_recall.png", "scores.npy"}
+
+
+def test_a_failed_run_leaves_no_half_files(run, lap, tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for file in lap.iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    (folder / "15.png").write_bytes(b"no picture")
+    error_line(run("detect", folder, "--out", tmp_path / "run", "--save-scores", *FAST))
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_videos_are_sources_and_references(run, lap, tmp_path):
+    video = tmp_path / "lap.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 64))
+    for i in range(16):
+        writer.write(cv2.imread(str(lap / f"{i}.png")))
+    writer.release()
+    out = tmp_path / "run"
+    assert run("detect", video, "--reference", video, "--out", out, "--save-scores", *FAST)[0] == 0
+    assert [row["match"] for row in rows_of(out)] == ["", "", "", *map(str, range(3, 16))]
+    assert np.load(out / "scores.npy").shape == (16, 16)
+
+
 def test_json_prints_one_object_and_nothing_else(run, lap, tmp_path):
     code, out, _ = run("detect", lap, "--out", tmp_path, "--json", *FAST)
     assert code == 0
@@ -120,7 +152,21 @@ def test_fit_then_detect_with_the_model(run, lap, tmp_path):
 def test_a_saved_detector_is_a_reference(run, lap, tmp_path):
     saved = tmp_path / "saved"
     assert run("detect", lap, "--out", tmp_path / "one", "--save-detector", saved, *FAST)[0] == 0
-    assert run("detect", lap, "--reference", saved, "--out", tmp_path / "two", "--threshold", 0.5, "--set", "decision.consistency=1")[0] == 0
+    assert (
+        run(
+            "detect",
+            lap,
+            "--reference",
+            saved,
+            "--out",
+            tmp_path / "two",
+            "--threshold",
+            0.5,
+            "--set",
+            "decision.consistency=1",
+        )[0]
+        == 0
+    )
     rows = rows_of(tmp_path / "two")
     assert [row["match"] for row in rows[3:]] == [str(i) for i in range(3, 16)]
 

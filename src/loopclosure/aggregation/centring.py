@@ -84,10 +84,10 @@ class RunningMean:
         return unit(descriptor - self._mean(self._sum).astype(np.float32))
 
     def _mean(self, total: np.ndarray) -> np.ndarray:
-        missing = _PRIOR_FRAMES - len(self._recent)
+        missing = min(_PRIOR_FRAMES, self.window) - len(self._recent)
         if self.prior is None or missing <= 0:
             return total / len(self._recent)
-        return (total + missing * self.prior) / _PRIOR_FRAMES
+        return (total + missing * self.prior) / (len(self._recent) + missing)
 
     @property
     def current(self) -> np.ndarray | None:

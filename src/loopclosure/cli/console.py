@@ -6,12 +6,13 @@ import json
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from loopclosure.runs import RunProgress
+if TYPE_CHECKING:
+    from loopclosure.runs import RunProgress
 
 
 def fail(message: str) -> int:

@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 
 from loopclosure.config import PRESETS, Config, Section, read_toml
 from loopclosure.errors import ConfigError
-from loopclosure.store import HEADER, load_arrays
+from loopclosure.store import HEADER, load_header, saved_config
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no summary.")]
@@ -23,7 +23,6 @@ _FLAGS = {
     "backbone": "features.backbone",
     "layer": "features.layer",
     "weights": "features.weights",
-    "backend": "features.backend",
     "gamma": "compression.gamma",
     "sequence_length": "sequence.length",
     "exclude_recent": "sequence.exclude_recent",
@@ -96,7 +95,7 @@ def _base(preset: str | None, model: Path | None, reference: Path | None) -> Con
     if preset is not None or not folders:
         return Config.preset(preset or "default")
     kind, folder = next(iter(folders.items()))
-    return Config.from_dict(load_arrays(folder, kind=kind)[0]["config"])
+    return saved_config(load_header(folder, kind=kind), folder)
 
 
 def _parse_pair(text: str) -> tuple[str, str]:

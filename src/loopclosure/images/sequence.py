@@ -72,6 +72,11 @@ class ImageSequence:
         self._frames = _open(self.source, on_error == "skip", max_megapixels)
 
     @property
+    def is_video(self) -> bool:
+        """Whether frames come one after the other, so that a jump is costly and the length may be an estimate."""
+        return isinstance(self._frames, _Video)
+
+    @property
     def names(self) -> list[str]:
         """One name a frame."""
         return self._frames.names

@@ -11,7 +11,10 @@ from loopclosure.config import Config
 from loopclosure.errors import FitError, ModelError
 from loopclosure.features.keypoints import DESCRIPTOR_SIZES, KeypointExtractor
 from loopclosure.matching.inverted_index import BagOfWordsMap, IncrementalMap
+from loopclosure.matching.sequences import SequenceScores
 from loopclosure.methods.base import Method
+
+_LEAST_SPREAD = 1e-4  # of L1 scores or log-odds; below it they differ by rounding
 
 
 class LocalFeatures:
@@ -55,15 +58,34 @@ def features_in(rows: np.ndarray) -> np.ndarray:
     return rows[rows.any(axis=1)]
 
 
+class StandardScores(SequenceScores):
+    """`SequenceScores` of similarities in standard deviations from the mean of the candidates of their frame.
+
+    How much two bags of one place have in common depends on the scene; how far they stand out depends on it less.
+    """
+
+    def push(self, similarities: np.ndarray) -> np.ndarray:
+        """Take the row of a new frame, float32 (n,), and return its sequence scores, NaN where there is no candidate.
+
+        A row that is the same everywhere counts as zeros.
+        """
+        row = np.asarray(similarities, np.float64)
+        candidates = row[: max(len(row) - max(self.exclude_recent - 1, 0), 0)]
+        spread = candidates.std() if len(candidates) else 0.0
+        return super().push((row - candidates.mean()) / spread if spread > _LEAST_SPREAD else np.zeros(len(row)))
+
+
 class BagOfWordsMethod(Method):
     """Compare images by the L1 score of their tf-idf weighted words (Galvez-Lopez & Tardos 2012).
+
+    The score of a loop is in standard deviations of the scores of a frame, see `StandardScores`.
 
     The vocabulary should come from other images than those of the drive (``loopclosure fit``). Without a model it is
     learned from the drive, which gives few words and a poor idea of how rare they are.
 
     Deviations from the source, beside those of `VocabularyTree` and `BagOfWordsMap`: RootSIFT unless
-    ``words.keypoints`` says ORB, and two levels of 100 branches instead of six of 10, because errors of the descent
-    cost more than the larger nodes.
+    ``words.keypoints`` says ORB, two levels of 100 branches instead of six of 10, because errors of the descent cost
+    more than the larger nodes, and standard deviations instead of division by the score against the previous frame.
 
     Parameters
     ----------
@@ -72,7 +94,7 @@ class BagOfWordsMethod(Method):
     """
 
     fitted = False
-    threshold = 0.25
+    threshold = 2.35
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
@@ -101,6 +123,12 @@ class BagOfWordsMethod(Method):
     def new_map(self, *, exclude_recent: int) -> BagOfWordsMap:  # noqa: ARG002  (each place is scored alone)
         """Return an empty map for bags of words."""
         return BagOfWordsMap()
+
+    def new_scores(self, *, exclude_recent: int) -> StandardScores:
+        """Return what sums standardised similarities over sequences."""
+        sequence = self.config.sequence
+        both = sequence.direction == "both"
+        return StandardScores(sequence.length, exclude_recent=exclude_recent, both_directions=both)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the vocabulary."""
@@ -135,7 +163,7 @@ class IncrementalBagOfWords(Method):
         Its sections `words` (but for the tree) and `sequence` are used.
     """
 
-    threshold = 0.2
+    threshold = 0.1
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)

@@ -12,7 +12,7 @@ from loopclosure.config import Config
 from loopclosure.errors import FitError, ModelError
 from loopclosure.matching.fabmap import FabMap
 from loopclosure.matching.inverted_index import InvertedIndex
-from loopclosure.methods.bag_of_words import BagOfWordsMethod
+from loopclosure.methods.bag_of_words import BagOfWordsMethod, StandardScores
 from loopclosure.methods.base import Method
 from loopclosure.store import part
 
@@ -20,15 +20,16 @@ from loopclosure.store import part
 class FabMapMethod(Method):
     """Score places by log-odds against all other places and a new one (Cummins & Newman 2008, 2011).
 
-    Scores have no bounds: 0 is a probability of one half for a single frame. Over a sequence they are averaged, and
-    the least mean of a loop lies far below 0, because frames of the right sequence that a neighbouring place takes
-    count with large negative odds.
+    The map gives log-odds: 0 is a probability of one half. Over a sequence they are counted in standard deviations of
+    the log-odds of a frame, see `StandardScores`: with few candidates, or with samples that resemble no place of the
+    drive, the best candidate is far more likely than all the rest, right or wrong.
 
     Vocabulary, tree and the samples of a new place should come from other images than those of the drive
     (``loopclosure fit``). Without a model they are learned from the drive, and then the places of the map stand for
     new ones too.
 
-    Deviations from the source: those of `FabMap`, `ChowLiuTree` and `VocabularyTree`.
+    Deviations from the source: standard deviations instead of probabilities decide; those of `FabMap`, `ChowLiuTree`
+    and `VocabularyTree`.
 
     Parameters
     ----------
@@ -37,7 +38,7 @@ class FabMapMethod(Method):
     """
 
     fitted = False
-    threshold = -33.0
+    threshold = 2.2
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
@@ -70,6 +71,10 @@ class FabMapMethod(Method):
     def new_map(self, *, exclude_recent: int) -> FabMap:
         """Return a map without places."""
         return FabMap(self._tree, self._samples, exclude_recent=exclude_recent)
+
+    def new_scores(self, *, exclude_recent: int) -> StandardScores:
+        """Return what sums standardised log-odds over sequences."""
+        return self._words.new_scores(exclude_recent=exclude_recent)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return vocabulary, tree and samples."""

@@ -52,6 +52,7 @@ class KLNetVLAD(Method):
         if self._reading != "none":
             self._kl = READINGS[self._reading](**self._rule)
         self._netvlad = NetVLAD(config.aggregation.clusters, seed=config.learning.seed)
+        self._blank: np.ndarray | None = None
         if self._reading == "sequence":
             self.window = config.sequence.length
 
@@ -77,7 +78,7 @@ class KLNetVLAD(Method):
                 self._kl.fit(stacked)
             if self._reading != "flat":
                 self._netvlad.fit(self._compress(stacked))
-        self.fitted = True
+        self.fitted, self._blank = True, None
 
     def describe(self, features: Sequence[np.ndarray]) -> np.ndarray:
         """Describe the newest of the last `window` frames.
@@ -111,8 +112,10 @@ class KLNetVLAD(Method):
 
     def blank(self) -> np.ndarray:
         """Return the descriptor of a frame that says nothing: zeros."""
-        black = np.zeros((self.config.features.height, self.config.features.width, 3), np.uint8)
-        return np.zeros_like(self.describe(self.features([black])))
+        if self._blank is None:
+            black = np.zeros((self.config.features.height, self.config.features.width, 3), np.uint8)
+            self._blank = np.zeros_like(self.describe(self.features([black])))
+        return self._blank
 
     def new_map(self, *, exclude_recent: int) -> VectorMap:  # noqa: ARG002  (all pairs cost the same here)
         """Return an empty map for the descriptors."""

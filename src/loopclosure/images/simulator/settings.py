@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
-from loopclosure.config import Section
-from loopclosure.errors import ConfigError, did_you_mean
+from loopclosure.config import Section, one_line
+from loopclosure.errors import ConfigError
 
 LightName = Literal["day", "dusk", "night"]
 
@@ -50,13 +50,4 @@ class SimulationSettings(Section):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise ConfigError(_one_line(error)) from None
-
-
-def _one_line(error: ValidationError) -> str:
-    first = error.errors()[0]
-    name = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        return f"unknown setting '{name}'{did_you_mean(name, SimulationSettings.model_fields)}"
-    message = str(first["msg"])
-    return f"{name} = {first['input']!r}: {message[0].lower()}{message[1:]}"
+            raise ConfigError(one_line(error, SimulationSettings.model_fields)) from None

@@ -150,23 +150,9 @@ def test_fit_then_detect_with_the_model(run, lap, tmp_path):
 
 
 def test_a_saved_detector_is_a_reference(run, lap, tmp_path):
-    saved = tmp_path / "saved"
+    saved, loose = tmp_path / "saved", ["--threshold", 0.5, "--set", "decision.consistency=1"]
     assert run("detect", lap, "--out", tmp_path / "one", "--save-detector", saved, *FAST)[0] == 0
-    assert (
-        run(
-            "detect",
-            lap,
-            "--reference",
-            saved,
-            "--out",
-            tmp_path / "two",
-            "--threshold",
-            0.5,
-            "--set",
-            "decision.consistency=1",
-        )[0]
-        == 0
-    )
+    assert run("detect", lap, "--reference", saved, "--out", tmp_path / "two", *loose)[0] == 0
     rows = rows_of(tmp_path / "two")
     assert [row["match"] for row in rows[3:]] == [str(i) for i in range(3, 16)]
 

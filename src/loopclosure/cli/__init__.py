@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 
 import typer
@@ -21,6 +22,9 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line: exit status 0 done, 1 an error in one line on stderr, 2 wrong usage."""
+    warnings = logging.StreamHandler(sys.stderr)
+    warnings.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+    logging.getLogger("loopclosure").addHandler(warnings)
     try:
         app(prog_name="loopclosure")
     except LoopClosureError as error:
@@ -31,6 +35,8 @@ def main() -> None:
         sys.exit(fail(f"{error.filename or 'file system'}: {error.strerror or error}"))
     except KeyboardInterrupt:
         sys.exit(130)
+    finally:
+        logging.getLogger("loopclosure").removeHandler(warnings)
 
 
-from loopclosure.cli import compare, datasets, detect, evaluate, fit, reproduce, simulate, tables  # noqa: E402, F401  (they register their commands)
+from loopclosure.cli import compare, datasets, detect, evaluate, explain, fit, reproduce, simulate, tables  # noqa: E402, F401  (they register their commands)

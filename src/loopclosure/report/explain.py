@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,30 +15,37 @@ from jinja2 import Environment, StrictUndefined
 from matplotlib.figure import Figure
 
 from loopclosure import __version__
-from loopclosure.aggregation.centring import RunningMean
 from loopclosure.config import Config
 from loopclosure.detect import Frames, LoopDetector
-from loopclosure.errors import ConfigError, FitError, ImageError, ResultsError
+from loopclosure.errors import FitError, ImageError, ResultsError
 from loopclosure.evaluation.log import LOOPS_FILE, read_loops
 from loopclosure.images.decode import read_image
 from loopclosure.images.sequence import ImageSequence
-from loopclosure.methods import Method
-from loopclosure.report.heatmaps import Explainer, View, check_explainable, matches, similarity
+from loopclosure.report.heatmaps import Explainer, View, check_explainable, cosine, matches
+from loopclosure.report.means import means_taken_out
 from loopclosure.report.overlays import draw_clusters, draw_heat
 from loopclosure.report.pairs import Pair, spread
 from loopclosure.report.spectrum import kl_spectrum
 from loopclosure.report.style import png
 from loopclosure.runs import MODEL, RUN, RunProgress, write_whole
+from loopclosure.store import HEADER
 
 PAGE = "explain.html"
 MAX_INFO_BYTES = 1 << 26
 _POSITIONS_A_CLUSTER = 16  # where the images themselves are all that there is to learn clusters from
 
 
-class Plate(NamedTuple):
+class Explanation(NamedTuple):
+    """What was written: the page, which holds all pictures, and the pictures as files of their own."""
+
+    page: Path
+    pictures: tuple[Path, ...]
+
+
+class _Plate(NamedTuple):
     """A picture of the page: its file, its heading and what to say of it."""
 
-    file: str
+    file: Path
     title: str
     text: str
     picture: str
@@ -51,7 +58,7 @@ def explain_run(
     query: int | None = None,
     most: int = 4,
     progress: RunProgress | None = None,
-) -> Path:
+) -> Explanation:
     """Show on the images of a run which positions made its loops.
 
     The descriptors are made again, with what the run had learned by its end. The mean that was taken out of each is
@@ -73,8 +80,7 @@ def explain_run(
 
     Returns
     -------
-    pathlib.Path
-        The page.
+    Explanation
 
     Raises
     ------
@@ -86,13 +92,13 @@ def explain_run(
     folder = Path(run)
     info = _read_info(folder)
     check_explainable(Config.from_dict(info["config"]))
-    pairs = _chosen(folder, len(read_loops(folder)), query, most)
+    pairs = _chosen(folder, query, most)
     detector = LoopDetector(model=folder / MODEL)
     queries, references = _images(info, detector.config)
     explainer = Explainer(detector.method)
     report = progress or (lambda *_: None)
-    means = _means(detector, pairs, queries, references, lambda *count: report("the mean of the drive", *count))
-    plates: list[Plate] = []
+    means = means_taken_out(detector, pairs, queries, references, lambda *count: report("mean of the drive", *count))
+    plates: list[_Plate] = []
     for number, pair in enumerate(pairs):
         left = explainer.look(_frame(queries, pair.query), means[0][pair.query])
         right = explainer.look(_frame(references or queries, pair.match), means[1][pair.match])
@@ -110,7 +116,7 @@ def explain_images(
     *,
     config: Config | None = None,
     model: str | os.PathLike[str] | None = None,
-) -> Path:
+) -> Explanation:
     """Show what makes two images similar, or what the descriptor of one image is made of.
 
     Parameters
@@ -125,8 +131,7 @@ def explain_images(
 
     Returns
     -------
-    pathlib.Path
-        The page.
+    Explanation
 
     Raises
     ------
@@ -177,9 +182,10 @@ def _read_info(folder: Path) -> dict[str, Any]:
     raise ResultsError(f"{file} is damaged: wanted a JSON object with config and source")
 
 
-def _chosen(folder: Path, frames: int, query: int | None, most: int) -> list[Pair]:
+def _chosen(folder: Path, query: int | None, most: int) -> list[Pair]:
     """Return the pairs to show, in the order of the drive."""
     log = read_loops(folder)
+    frames = len(log)
     pairs = [
         Pair(int(i), int(log.match[i]), float(log.score[i]), bool(log.accepted[i]))
         for i in np.flatnonzero(log.match >= 0)
@@ -205,8 +211,9 @@ def _images(info: Mapping[str, Any], config: Config) -> tuple[ImageSequence, Ima
     queries = opened(info["source"])
     if info["reference"] is None:
         return queries, None
-    references = opened(info["reference"])
-    return queries, references
+    if (Path(info["reference"]) / HEADER).is_file():
+        raise ResultsError(f"the references of the run are the saved detector {info['reference']}: no images to show")
+    return queries, opened(info["reference"])
 
 
 def _frame(images: Frames, position: int) -> np.ndarray:
@@ -216,66 +223,9 @@ def _frame(images: Frames, position: int) -> np.ndarray:
     return image
 
 
-def _means(
-    detector: LoopDetector,
-    pairs: Sequence[Pair],
-    queries: ImageSequence,
-    references: ImageSequence | None,
-    progress: Callable[[int, int], None],
-) -> tuple[Mapping[int, np.ndarray | None], Mapping[int, np.ndarray | None]]:
-    """Return the mean that was taken out of each query and of each match."""
-    wanted, matched = {pair.query for pair in pairs}, {pair.match for pair in pairs}
-    window = detector.config.aggregation.centre_window
-    if window == 0:
-        return dict.fromkeys(wanted), dict.fromkeys(matched)
-    if references is None:
-        prior = _mean_of(detector.method, queries, range(min(window, len(queries))), lambda *_: None)
-        means = _running_means(detector.method, queries, wanted | matched, window, prior, progress)
-        return means, means
-    prior = _mean_of(detector.method, references, range(len(references)), progress)
-    window = max(window, len(references))
-    return _running_means(detector.method, queries, wanted, window, prior, progress), dict.fromkeys(matched, prior)
-
-
-def _running_means(
-    method: Method,
-    images: Frames,
-    wanted: Iterable[int],
-    window: int,
-    prior: np.ndarray | None,
-    progress: Callable[[int, int], None],
-) -> dict[int, np.ndarray | None]:
-    """Return the running mean at each wanted frame; frames that are in no window are left out."""
-    mean, done = RunningMean(window, prior=prior), 0
-    found: dict[int, np.ndarray | None] = {}
-    last = max(wanted) + 1
-    for frame in sorted(wanted):
-        for i in range(max(done, frame + 1 - window), frame + 1):
-            mean.centre(_described(method, images[i]))
-            progress(i + 1, last)
-        done = frame + 1
-        found[frame] = mean.current
-    return found
-
-
-def _mean_of(
-    method: Method, images: Frames, frames: range, progress: Callable[[int, int], None]
-) -> np.ndarray | None:
-    total, count = 0.0, 0
-    for i in frames:
-        descriptor = _described(method, images[i])
-        total, count = total + descriptor.astype(np.float64), count + bool(descriptor.any())
-        progress(i + 1, len(frames))
-    return np.asarray(total / count, np.float32) if count else None
-
-
-def _described(method: Method, image: np.ndarray | None) -> np.ndarray:
-    return method.blank() if image is None else method.describe(method.features([image]))
-
-
 def _draw(
     out: Path, explainer: Explainer, views: Sequence[View], names: Sequence[str], said: str, suffix: str
-) -> list[Plate]:
+) -> list[_Plate]:
     """Draw one image or a pair: heat maps with matches, and clusters."""
     first, last = views[0], views[-1]
     heats = [explainer.heat(view, other) for view, other in zip(views, reversed(views), strict=True)]
@@ -284,21 +234,22 @@ def _draw(
     if len(views) > 1:
         pairs = matches(first, last)
         title = " and ".join(names)
-        text = f"{said}Similarity of the two frames alone {similarity(first, last):.3f}."
+        alike = cosine(first, last)
+        text = f"{said}Score of the two frames alone {(1 + alike) / 2:.3f}, from a cosine of {alike:.3f}."
     return [
         _plate(out, f"heat_{suffix}.png", title, text, draw_heat(views, heats, names, pairs)),
         _plate(out, f"clusters_{suffix}.png", "", "", draw_clusters(views, names)),
     ]
 
 
-def _plate(out: Path, file: str, title: str, text: str, figure: Figure) -> Plate:
+def _plate(out: Path, file: str, title: str, text: str, figure: Figure) -> _Plate:
     out.mkdir(parents=True, exist_ok=True)
     content = png(figure)
     (out / file).write_bytes(content)
-    return Plate(file, title, text, f"data:image/png;base64,{base64.b64encode(content).decode('ascii')}")
+    return _Plate(out / file, title, text, f"data:image/png;base64,{base64.b64encode(content).decode('ascii')}")
 
 
-def _write(out: Path, title: str, detector: LoopDetector, plates: list[Plate], centred: str) -> Path:
+def _write(out: Path, title: str, detector: LoopDetector, plates: list[_Plate], centred: str) -> Explanation:
     arrays, spectrum = detector.method.to_arrays(), None
     if "kl.energies" in arrays:
         figure = kl_spectrum(arrays["kl.energies"], kept=len(arrays["kl.basis"]))
@@ -321,4 +272,4 @@ def _write(out: Path, title: str, detector: LoopDetector, plates: list[Plate], c
     )
     file = out / PAGE
     write_whole(file, page.encode("utf-8", "replace").decode("utf-8"))  # a file name may hold what is no text
-    return file
+    return Explanation(file, tuple(plate.file for plate in [*plates, *([spectrum] if spectrum else [])]))

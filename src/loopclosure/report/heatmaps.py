@@ -2,9 +2,9 @@
 
 Grad-CAM (Selvaraju et al., ICCV 2017) weights the channels of a layer by their gradient, averaged over positions. That
 is right where positions are summed next. In NetVLAD the layer before the sum is the map of residuals
-``a_k(y_i) (y_i - c_k)``, K * D channels, and there the heat is exactly what each position adds to the cosine. At the tap
-of the backbone it is not: local vectors are scaled to length 1 behind it, so that the gradient at each position is at
-right angles to the vector that it is multiplied with.
+``a_k(y_i) (y_i - c_k)``, K * D channels, and there the heat is exactly what each position adds to the similarity.
+At the tap of the backbone it is not: local vectors are scaled to length 1 behind it, so that the gradient at each
+position is at right angles to the vector that it is multiplied with.
 """
 
 from __future__ import annotations
@@ -198,20 +198,20 @@ class Explainer:
         return np.clip(cv2.resize(heat, (width, height), interpolation=cv2.INTER_CUBIC), 0, 1)
 
 
-def similarity(left: View, right: View) -> float:
-    """Return the cosine of two centred descriptors."""
+def cosine(left: View, right: View) -> float:
+    """Return the cosine of two centred descriptors; the score of the two frames alone is ``(1 + cosine) / 2``."""
     return float(left.descriptor @ right.descriptor)
 
 
 def matches(left: View, right: View, most: int = 10) -> list[Match]:
-    """Return the pairs of positions that add most to the similarity, each the best partner of the other.
+    """Return the pairs of positions that add most to the cosine, each the best partner of the other.
 
-    The similarity is the sum over all pairs of positions, because each descriptor is the sum over its own.
+    The cosine is the sum over all pairs of positions, because each descriptor is the sum over its own.
     """
     pairs = _evenly_centred(left) @ _evenly_centred(right).T
     best_right, best_left = pairs.argmax(1), pairs.argmax(0)
-    rows = np.flatnonzero(best_left[best_right] == np.arange(len(pairs)))
-    found = [(i, best_right[i], pairs[i, best_right[i]]) for i in rows if pairs[i, best_right[i]] > 0]
+    rows = np.flatnonzero(best_left[best_right] == np.arange(len(pairs))).tolist()
+    found = [(i, int(best_right[i]), pairs[i, best_right[i]]) for i in rows if pairs[i, best_right[i]] > 0]
     shapes = left.clusters.shape, right.clusters.shape
     return [
         Match(_place(i, shapes[0]), _place(j, shapes[1]), float(share))
@@ -220,7 +220,7 @@ def matches(left: View, right: View, most: int = 10) -> list[Match]:
 
 
 def cluster_shares(left: View, right: View) -> np.ndarray:
-    """Return what each cluster adds to the similarity, float32 (K,); the sum is the similarity."""
+    """Return what each cluster adds to the cosine, float32 (K,)."""
     clusters = left.residuals.shape[2]
     return (left.descriptor * right.descriptor).reshape(clusters, -1).sum(1)
 
@@ -233,7 +233,7 @@ def _evenly_centred(view: View) -> np.ndarray:
 
 
 def _place(position: int, shape: tuple[int, ...]) -> tuple[int, int]:
-    return int(position) // shape[1], int(position) % shape[1]
+    return position // shape[1], position % shape[1]
 
 
 def _tensor(maps: np.ndarray) -> torch.Tensor:

@@ -93,9 +93,7 @@ def draw_clusters(views: Sequence[View], names: Sequence[str]) -> Figure:
         _show(axes, _colored(view, colors), name)
         _number(axes, view, colors)
     whole = float(shares.sum())
-    handles = [
-        Patch(color=color, label=f"cluster {k}: {shares[k]:.3f} of {whole:.3f}") for k, color in colors.items()
-    ]
+    handles = [Patch(color=color, label=f"cluster {k}: {shares[k]:.3f} of {whole:.3f}") for k, color in colors.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, **LEGEND)
     return figure
 
@@ -104,6 +102,7 @@ def _grid(views: Sequence[View], *, rows: int) -> tuple[Figure, np.ndarray]:
     width = _WIDTH * (1 if len(views) > 1 else 0.6)
     tallest = max(min(2.0, view.image.shape[0] / view.image.shape[1]) for view in views)
     figure = new_figure(width, rows * width / len(views) * tallest + _HEAD + _FOOT)
+    figure.set_layout_engine("constrained", wspace=0.02, h_pad=0.07)
     return figure, figure.subplots(rows, len(views), squeeze=False)
 
 
@@ -122,7 +121,9 @@ def _join(axes: np.ndarray, views: Sequence[View], match: Match, number: int) ->
     axes[0].figure.add_artist(line)
     disc = {"boxstyle": "circle,pad=0.25", "facecolor": _LINE, "edgecolor": "black", "linewidth": 0.6}
     for panel, end in zip(axes, ends, strict=True):
-        label = Annotation(str(number), end, xycoords=panel.transData, ha="center", va="center", fontsize=6.5, bbox=disc)
+        label = Annotation(
+            str(number), end, xycoords=panel.transData, ha="center", va="center", fontsize=6.5, bbox=disc
+        )
         label.set(in_layout=False, zorder=5)  # above the lines, which lie above the axes
         panel.figure.add_artist(label)
 
@@ -149,7 +150,7 @@ def _number(axes: Axes, view: View, colors: dict[int, str]) -> None:
     for cluster in colors:
         for place in np.argwhere(view.clusters == cluster):
             x, y = _center(view, (int(place[0]), int(place[1])))
-            axes.text(x, y, cluster, ha="center", va="center", color="white", fontsize=6, path_effects=outline)
+            axes.text(x, y, str(cluster), ha="center", va="center", color="white", fontsize=6, path_effects=outline)
 
 
 def _grey(image: np.ndarray) -> np.ndarray:

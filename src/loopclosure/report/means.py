@@ -1,0 +1,86 @@
+"""What a run took out of its descriptors, computed again from the images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+
+from loopclosure.aggregation.centring import RunningMean
+from loopclosure.detect import Frames, LoopDetector
+from loopclosure.images.sequence import ImageSequence
+from loopclosure.methods import Method
+from loopclosure.report.pairs import Pair
+
+
+def means_taken_out(
+    detector: LoopDetector,
+    pairs: Sequence[Pair],
+    queries: ImageSequence,
+    references: ImageSequence | None,
+    progress: Callable[[int, int], None],
+) -> tuple[Mapping[int, np.ndarray | None], Mapping[int, np.ndarray | None]]:
+    """Return the mean that was taken out of each query and of each match of a run.
+
+    Parameters
+    ----------
+    detector : LoopDetector
+        With the model of the run.
+    pairs : sequence of Pair
+        Queries and matches that are asked for.
+    queries, references : ImageSequence
+        References are None in one stream.
+    progress : callable
+        ``progress(done, total)`` in frames.
+
+    Returns
+    -------
+    of_queries, of_matches : mapping of int to (ndarray of float32, shape (d,), or None)
+        By frame; None where nothing was taken out.
+    """
+    wanted, matched = {pair.query for pair in pairs}, {pair.match for pair in pairs}
+    window = detector.config.aggregation.centre_window
+    if window == 0:
+        return dict.fromkeys(wanted), dict.fromkeys(matched)
+    if references is None:
+        prior = _mean_of(detector.method, queries, range(min(window, len(queries))), lambda *_: None)
+        means = _running_means(detector.method, queries, wanted | matched, window, prior, progress)
+        return means, means
+    prior = _mean_of(detector.method, references, range(len(references)), progress)
+    window = max(window, len(references))
+    return _running_means(detector.method, queries, wanted, window, prior, progress), dict.fromkeys(matched, prior)
+
+
+def _running_means(
+    method: Method,
+    images: Frames,
+    wanted: Iterable[int],
+    window: int,
+    prior: np.ndarray | None,
+    progress: Callable[[int, int], None],
+) -> dict[int, np.ndarray | None]:
+    """Return the running mean at each wanted frame; frames that are in no window are left out."""
+    mean, done = RunningMean(window, prior=prior), 0
+    found: dict[int, np.ndarray | None] = {}
+    last = max(wanted) + 1
+    for frame in sorted(wanted):
+        for i in range(max(done, frame + 1 - window), frame + 1):
+            mean.centre(_described(method, images[i]))
+            progress(i + 1, last)
+        done = frame + 1
+        found[frame] = mean.current
+    return found
+
+
+def _mean_of(method: Method, images: Frames, frames: range, progress: Callable[[int, int], None]) -> np.ndarray | None:
+    total, count = np.zeros_like(method.blank(), np.float64), 0
+    for i in frames:
+        descriptor = _described(method, images[i])
+        total += descriptor
+        count += bool(descriptor.any())  # a blank frame is not counted
+        progress(i + 1, len(frames))
+    return (total / count).astype(np.float32) if count else None
+
+
+def _described(method: Method, image: np.ndarray | None) -> np.ndarray:
+    return method.blank() if image is None else method.describe(method.features([image]))

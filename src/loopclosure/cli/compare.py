@@ -26,7 +26,7 @@ def compare(
     out: Annotated[Path, typer.Option(help="Folder to write; each method's run folder is in it.")] = Path("compare"),
     methods: Annotated[str, typer.Option(help="Names with commas between them, or all.")] = "all",
     reference: Annotated[Path | None, typer.Option(help="Another traverse, that alone holds the candidates.")] = None,
-    tolerance: Annotated[int, typer.Option(help="A match so many frames from a true one is right.")] = 0,
+    tolerance: Annotated[int, typer.Option(min=0, help="A match so many frames from a true one is right.")] = 0,
     view: Annotated[View, typer.Option(help="Truth of one camera of an interleaved stereo set.")] = "all",
     key: Annotated[str | None, typer.Option(help="Name of the matrix in a .mat file.")] = None,
     radius: Annotated[float | None, typer.Option("--radius", help="Truth by poses: same place, metres.")] = None,

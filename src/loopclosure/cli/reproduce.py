@@ -34,7 +34,9 @@ def reproduce(
     layers: Annotated[str, typer.Option(help="Taps with commas between them (default: all).")] = "",
     methods: Annotated[str, typer.Option(help="Methods of Tables 6 and 7: a,b,c, all, or none.")] = "all",
     view: Annotated[Views | None, typer.Option(help="Cameras of a set of left and right images by turns.")] = None,
-    tolerance: Annotated[int | None, typer.Option(help="A match so many frames from a true one is right.")] = None,
+    tolerance: Annotated[
+        int | None, typer.Option(min=0, help="A match so many frames from a true one is right.")
+    ] = None,
     limit: Annotated[int | None, typer.Option(help="Only so many first images of each camera: a quick look.")] = None,
     exclude_recent: Annotated[int | None, typer.Option(help="Frames nearer than this are no candidates.")] = None,
     key: Annotated[str | None, typer.Option(help="Name of the matrix in a .mat file.")] = None,
@@ -112,8 +114,7 @@ def _print_tables(result: Reproduction, *, quiet: bool) -> None:
     from loopclosure.report.experiments import method_rows, recall_rows
 
     for experiment in result.experiments:
-        mark = ", random weights" * result.random
-        say(f"{result.name}, {experiment.view}: R@100P in percent (the paper's), {result.weights}{mark}", quiet=quiet)
+        say(f"{result.name}, {experiment.view}: R@100P in percent (the paper's), {result.network}", quiet=quiet)
         say(f"{'layer':<8}" + "".join(f"{ratio_name(gamma):>18}" for gamma in (None, *GAMMAS)), quiet=quiet)
         for row in recall_rows(experiment):
             cells = (f"{cell.text} ({cell.under.removeprefix('paper ')})" for cell in row.cells)

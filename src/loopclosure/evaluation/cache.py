@@ -190,7 +190,7 @@ class MapCache:
         path = self._path(start, layer)
         try:
             maps = np.load(path, mmap_mode="r")
-        except (OSError, ValueError) as error:
+        except (OSError, EOFError, ValueError) as error:
             raise ResultsError(f"{path} is damaged ({error}); delete it, and it is made anew") from None
         return maps
 

@@ -58,8 +58,9 @@ class MethodResult:
 
     @property
     def network(self) -> str:
-        """Name of the weights that made the features; empty where there is no network."""
-        return str(self.info["weights"].get("weights", "")) if self.info else ""
+        """Which network made the features, with which weights; empty where there is none."""
+        weights = self.info["weights"].get("weights") if self.info else None
+        return network_name(self.info["config"]["features"]["backbone"], weights) if weights else ""
 
 
 @dataclass(frozen=True)
@@ -165,6 +166,17 @@ def compare_methods(
         protocol=next((dict(result.metrics["protocol"]) for result in results if result.metrics), {}),
         machine=describe_machine(),
     )
+
+
+def network_name(backbone: str, weights: str) -> str:
+    """Return what a network is called; most names of weights begin with that of their network.
+
+    Examples
+    --------
+    >>> network_name("resnet152", "random (seed 0)"), network_name("vgg16", "vgg16-imagenet1k-v1")
+    ('resnet152, random (seed 0)', 'vgg16-imagenet1k-v1')
+    """
+    return weights if weights.startswith(backbone) else f"{backbone}, {weights}"
 
 
 def method_names(methods: str | Sequence[str]) -> list[str]:

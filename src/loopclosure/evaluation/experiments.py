@@ -16,7 +16,7 @@ from loopclosure.detect import LoopDetector
 from loopclosure.errors import ConfigError, ImageError, WeightsError
 from loopclosure.evaluation import paper
 from loopclosure.evaluation.cache import MapCache, digest, image_paths
-from loopclosure.evaluation.compare import MethodResult, judge_run, method_names, replaceable, run_method
+from loopclosure.evaluation.compare import MethodResult, judge_run, method_names, network_name, replaceable, run_method
 from loopclosure.evaluation.grid import Cell, fill_grid
 from loopclosure.evaluation.machine import describe_machine
 from loopclosure.evaluation.metrics import PrecisionRecall
@@ -121,6 +121,11 @@ class Reproduction:
     machine: str
 
     @property
+    def network(self) -> str:
+        """Name of the network and its weights."""
+        return network_name(self.config.features.backbone, self.weights)
+
+    @property
     def random(self) -> bool:
         """Whether the network was never trained."""
         return self.config.features.weights == RANDOM
@@ -184,8 +189,8 @@ def reproduce(
         raise ConfigError(f"limit is {limit}, wanted at least 2 frames")
     data = _open(name, images, truth, truth_settings)
     config, note = _with_weights(config or Config.preset("paper"), progress)
-    config = config.with_settings({"sequence.exclude_recent": max(config.sequence.exclude_recent, data.exclude_recent)})
-    layers = tuple(layers) or _all_layers(config)
+    known = _all_layers(config)
+    layers = tuple(sorted(set(layers), key=lambda layer: known.index(layer) if layer in known else 0)) or known
     bench = _Bench(data, Path(out), config, layers, names, data.tolerance if tolerance is None else tolerance, limit)
     experiments = [bench.run(camera, progress) for camera in _cameras(data, view)]
     record = weights_for(config.features.backbone, config.features.weights)
@@ -213,7 +218,6 @@ class _Data:
     truth: Path
     settings: dict[str, Any]
     tolerance: int
-    exclude_recent: int
 
 
 def _open(
@@ -228,14 +232,13 @@ def _open(
         if opened.truth_path is None:
             raise ConfigError(f"{name} has no truth in this folder; give it with --truth")
         settings = {key: value for key, value in opened.truth_settings.items() if key != "view"}
-        return _Data(name, opened.images, opened.truth_path, settings, opened.tolerance, 0)
+        return _Data(name, opened.images, opened.truth_path, settings, opened.tolerance)
     if images is None or truth is None:
         raise ConfigError(
             f"'{name}' is none of the paper's data sets ({', '.join(paper.SETS)}), "
             "so it wants both: --images (a folder or a text file of paths) and --truth"
         )
-    exclude = int(settings.pop("exclude_recent", 0))
-    return _Data(name, ImageSequence(images), Path(truth), settings, 0, exclude)
+    return _Data(name, ImageSequence(images), Path(truth), settings, 0)
 
 
 def _cameras(data: _Data, view: str | None) -> tuple[View, ...]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from loopclosure import store
-from loopclosure.aggregation.centring import RunningMean
+from loopclosure.aggregation.centring import RunningMean, centre_traverse
 from loopclosure.aggregation.netvlad import NetVLAD
 from loopclosure.compression import ChannelKL, choose_components
 from loopclosure.config import Config
@@ -162,13 +162,20 @@ class _Layer:
         size = netvlad.centres_.size
         with tempfile.TemporaryFile() as file:  # descriptors of a long drive are larger than memory
             descriptors = np.memmap(file, np.float32, "w+", shape=(len(self._maps), size))
-            mean = RunningMean(self._config.aggregation.centre_window)
+            mean = self._mean(netvlad, codes)
             row = 0
             for block in self._maps.blocks(self._layer):
                 for descriptor in netvlad.transform(codes(block)):
                     descriptors[row] = mean.centre(descriptor)
                     row += 1
             return best_matches(descriptors, self._config)
+
+    def _mean(self, netvlad: NetVLAD, codes: Codes) -> RunningMean:
+        """Return what takes the running mean out, if that is asked for; it begins with the mean of the sample."""
+        window = self._config.aggregation.centre_window
+        if not window:
+            return RunningMean(0)
+        return RunningMean(window, prior=centre_traverse(netvlad.transform(codes(self._sample)), window=window)[1])
 
 
 def fitting_frames(frames: int, frame_bytes: int, config: Config) -> list[int]:

@@ -163,7 +163,7 @@ class IncrementalBagOfWords(Method):
         Its sections `words` (but for the tree) and `sequence` are used.
     """
 
-    threshold = 0.1
+    threshold = 0.095
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)

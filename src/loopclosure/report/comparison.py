@@ -167,7 +167,7 @@ def _cells(result: MethodResult, best: Mapping[str, float | None]) -> list[Cell]
     cells = []
     for name in MEASURES:
         value = result.metrics[name]
-        wins = value is not None and ranks(result) and value == best[name]
+        wins = bool(value) and ranks(result) and value == best[name]
         cells.append(Cell(percent(value).removesuffix(" %"), wins, _interval(result.metrics, name)))
     return [*cells, Cell(f"{result.milliseconds:.1f}")]
 

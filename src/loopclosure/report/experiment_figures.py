@@ -99,7 +99,7 @@ def curves_by_layer(grid: Sequence[GridResult]) -> Figure:
     layers = list(dict.fromkeys(result.cell.layer for result in grid))
     columns = 2 if len(layers) in (2, 4) else min(len(layers), _PANEL_COLUMNS)
     rows = -(-len(layers) // columns)
-    figure = new_figure(3.3 * columns, 2.9 * rows + 0.4, gap=0.04)
+    figure = new_figure((4.2 if columns < _PANEL_COLUMNS else 3.3) * columns, 2.9 * rows + 0.4, gap=0.04)
     panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     for axes, layer in zip(panels, layers, strict=False):
         results = [result for result in grid if result.cell.layer == layer]

@@ -95,7 +95,7 @@ def recall_rows(experiment: Experiment, measure: str = _HEAD) -> list[LayerRow]:
 def _grid_cell(result: GridResult, measure: str, best: float | None) -> Cell:
     value = result.metrics[measure]
     below = f"paper {_DASH if result.paper is None else f'{result.paper:.2f}'}"
-    return Cell(_share(value), value is not None and value == best, below)
+    return Cell(_share(value), bool(value) and value == best, below)
 
 
 def method_rows(result: Reproduction, experiment: Experiment) -> list[MethodRow]:
@@ -132,8 +132,8 @@ def _own_row(
     time = f"{known.milliseconds:.2f}" if known else _DASH
     recall = _DASH if chosen.paper is None else f"{chosen.paper:.2f}"
     return MethodRow(
-        f"{chosen.cell.layer} + KL {figures.ratio_name(gamma)} + NetVLAD",
-        f"{result.weights}; the ratio of Table 6's {source}",
+        f"{chosen.cell.layer} + KL {figures.ratio_name(gamma)}",
+        f"{result.network}; by Table 6's {source}",
         ["random weights"] if result.random else [],
         _cells(chosen.metrics, milliseconds, best, recall, time, races=not result.random),
         "",
@@ -167,7 +167,7 @@ def _cells(
         value, under = metrics[name], ""
         if name == _HEAD and (interval := metrics.get(f"{name}_interval")):
             under = " to ".join(f"{100 * end:.0f}" for end in interval)
-        cells.append(Cell(_share(value), races and value is not None and value == best[name], under))
+        cells.append(Cell(_share(value), races and bool(value) and value == best[name], under))
     cells.insert(1, Cell(paper_recall, paper=True))
     here = _DASH if milliseconds is None else f"{milliseconds:.1f}"
     return [*cells, Cell(here), Cell(paper_time, paper=True)]
@@ -199,7 +199,11 @@ def method_records(result: Reproduction, experiment: Experiment) -> Iterator[dic
         gamma = cell.cell.gamma
         name = f"{cell.cell.layer}-kl-{gamma:g}-netvlad"
         milliseconds = experiment.milliseconds.get(gamma or 0.0)
-        info = {"weights": {"weights": result.weights}, "learned_on": [cell.cell.fitted_on]}
+        info = {
+            "weights": {"weights": result.weights},
+            "config": result.config.model_dump(),
+            "learned_on": [cell.cell.fitted_on],
+        }
         mark = "random weights" if result.random else ""
         own = MethodResult(name, cell.metrics, cell.curve, milliseconds, info, mark)
         time = paper.OURS.milliseconds if in_paper else None
@@ -249,7 +253,7 @@ def _part(result: Reproduction, experiment: Experiment, names: paper.PaperSet, f
     fitted = "; ".join(sorted({cell.cell.fitted_on for cell in experiment.grid}))
     grid_line = (
         f"Protocol: {line}. Basis and clusters fitted on the test images ({fitted}). {_settings(result)} "
-        f"Network: {result.weights}."
+        f"Network: {result.network}."
     )
     methods = method_rows(result, experiment)
     return {
@@ -270,6 +274,7 @@ class _Picture(NamedTuple):
     title: str
     about: str
     figure: Figure
+    of_network: bool = True
 
 
 def _figures(result: Reproduction, experiment: Experiment, names: paper.PaperSet) -> Iterator[_Picture]:
@@ -285,6 +290,7 @@ def _figures(result: Reproduction, experiment: Experiment, names: paper.PaperSet
         f"{names.truth_figure}: truth",
         "Each point is a pair of frames that show one place.",
         figures.truth_matrix(experiment.truth),
+        of_network=False,
     )
     yield _Picture(
         f"{_file(names.distance_figure)}-distances",
@@ -316,7 +322,7 @@ def _saved(item: _Picture, folder: Path, view: str) -> dict[str, Any]:
     picture = png(item.figure)
     (folder / f"{item.file}-{view}.png").write_bytes(picture)
     width = round(PIXELS_PER_INCH * item.figure.get_figwidth())
-    return {"title": item.title, "about": item.about, "image": embed(picture), "width": width}
+    return {**item._asdict(), "image": embed(picture), "width": width}
 
 
 def _protocol(experiment: Experiment) -> Mapping[str, Any]:
@@ -346,7 +352,7 @@ def _settings(result: Reproduction) -> str:
 def _lead(result: Reproduction) -> str:
     frames = " and ".join(str(experiment.frames) for experiment in result.experiments)
     beside = "beside the paper's own numbers" if result.name in paper.SETS else "on data that the paper did not use"
-    return f"Tables 4 to 7 of Jiang, Zhou and Sun 2024 on {frames} images, {beside}. Network: {result.weights}."
+    return f"Tables 4 to 7 of Jiang, Zhou and Sun 2024 on {frames} images, {beside}. Network: {result.network}."
 
 
 def _warnings(result: Reproduction) -> Iterator[tuple[str, str]]:
@@ -368,7 +374,7 @@ def _facts(result: Reproduction) -> list[tuple[str, str]]:
     return [
         ("Images", result.source),
         ("Truth SHA-256", str(protocol["truth_hash"])),
-        ("Network", f"{config.features.backbone}, {result.weights}, layers {', '.join(result.layers)}"),
+        ("Network", f"{result.network}; layers {', '.join(result.layers)}"),
         ("Weights SHA-256", result.weights_sha256 or "none: drawn, not learned"),
         ("Settings", _settings(result)),
         ("Threshold", "the method's own" if alpha is None else f"score {alpha:g}, a distance alpha of {1 - alpha:.1f}"),

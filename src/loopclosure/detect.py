@@ -21,6 +21,7 @@ from loopclosure.timing import Stopwatch
 from loopclosure.traverse import Traverse, describe, describe_traverse
 from loopclosure.warmup import WarmUp
 
+_MEAN = "mean_of_fit"  # beside the arrays of a method
 Progress = Callable[[int, int], None]
 
 
@@ -357,7 +358,7 @@ class LoopDetector:
         return detector
 
     def _learned_arrays(self) -> dict[str, np.ndarray]:
-        return self.method.to_arrays() | ({} if self._mean is None else {"mean": self._mean})
+        return self.method.to_arrays() | ({} if self._mean is None else {_MEAN: self._mean})
 
     def _header(self) -> dict[str, Any]:
         return {
@@ -371,8 +372,8 @@ class LoopDetector:
             raise ModelError(
                 f"fitted with {header['provenance']}, here are {self.method.provenance}; fetch those weights"
             )
-        self.method.restore(arrays)
-        self._mean = arrays.get("mean")
+        self.method.restore({name: array for name, array in arrays.items() if name != _MEAN})
+        self._mean = arrays.get(_MEAN)
         self.learned_on = list(header["learned_on"])
 
 

@@ -47,7 +47,7 @@ def save_arrays(
     path.mkdir(parents=True, exist_ok=True)
     arrays_part, header_part = path / f"{ARRAYS}.part", path / f"{HEADER}.part"
     save_file({name: np.asarray(array, order="C") for name, array in arrays.items()}, arrays_part)
-    text = {"format": FORMAT, "kind": kind, "arrays_sha256": file_sha256(arrays_part), **header}
+    text = {**header, "format": FORMAT, "kind": kind, "arrays_sha256": file_sha256(arrays_part)}
     header_part.write_text(json.dumps(text, indent=2) + "\n", encoding="utf-8")
     os.replace(arrays_part, path / ARRAYS)
     os.replace(header_part, path / HEADER)

@@ -135,7 +135,7 @@ class VocabularyTree:
         FitError
             If there is no image, or kinds are mixed. Images without any descriptor make a vocabulary of one word.
         """
-        if not images:
+        if len(images) == 0:
             raise FitError("found no images, a vocabulary wants at least one")
         if len({(descriptors.dtype == np.uint8, descriptors.shape[1]) for descriptors in images}) > 1:
             raise FitError("the images have descriptors of different kinds; make them with one extractor")

@@ -20,6 +20,7 @@ from loopclosure.weights import (
     DEFAULTS,
     WEIGHTS,
     Weights,
+    all_weights,
     cache_folder,
     fetch,
     file_sha256,
@@ -27,6 +28,7 @@ from loopclosure.weights import (
     locate,
     weights_for,
 )
+from loopclosure.weights.imported import write_record
 
 CONTENT = np.random.default_rng(0).bytes(3 << 20)
 DIGEST = hashlib.sha256(CONTENT).hexdigest()
@@ -286,3 +288,69 @@ def test_processes_that_fetch_at_once(server: Server, cache: Path) -> None:
 def test_import_loads_no_torch() -> None:
     code = "import sys, loopclosure.weights; sys.exit('torch' in sys.modules or 'requests' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], env=dict(os.environ), check=False).returncode == 0
+
+
+# --- imported weights
+
+
+@pytest.fixture
+def imported(cache: Path) -> Weights:
+    cache.mkdir(parents=True)
+    (cache / "mine.safetensors").write_bytes(CONTENT)
+    row = Weights(
+        name="mine",
+        backbone="resnet50",
+        sha256=DIGEST,
+        size_mb=3.0,
+        licence="CC BY",
+        source="x.caffemodel",
+        path=cache / "mine.safetensors",
+        mean=(0.1, 0.2, 0.3),
+        variant="caffe",
+    )
+    write_record(cache, row, source_sha256="0" * 64)
+    return row
+
+
+def test_imported_weights_are_found_by_name(imported: Weights, cache: Path) -> None:
+    assert weights_for("resnet50", "mine") == imported
+    assert all_weights() == [*WEIGHTS.values(), imported]
+    assert is_cached("mine")
+    assert locate("mine") == cache / "mine.safetensors"
+    with pytest.raises(WeightsError, match="the weights 'mine' are for resnet50, the backbone is vgg16"):
+        weights_for("vgg16", "mine")
+    with pytest.raises(WeightsError, match="did you mean 'mine'"):
+        weights_for("resnet50", "mines")
+    with pytest.raises(WeightsError, match="did you mean 'mine'"):
+        locate("mines")
+    with pytest.raises(WeightsError, match="no address"):
+        fetch("mine")
+    (cache / "mine.safetensors").write_bytes(CONTENT[:-1])
+    with pytest.raises(WeightsError, match=r"mine\.safetensors is damaged; import it again"):
+        locate("mine")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"format": 1', '"format": 2'),
+        ('"RGB"', '"BGR"'),
+        ('"resnet50"', '"resnet51"'),
+        (f'"{DIGEST}"', "null"),
+        ('"sha256"', '"sha1"'),
+        ("0.2,", ""),
+        ("0.3", '"red"'),
+        ("{", "["),
+        ("{", " " * 70_000 + "{"),
+    ],
+)
+def test_damaged_records_are_one_line(imported: Weights, cache: Path, old: str, new: str) -> None:
+    file = cache / "mine.json"
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new, 1))
+    for ask in (lambda: weights_for("resnet50", "mine"), all_weights):
+        with pytest.raises(WeightsError, match=r"mine\.json is damaged .*; delete it and import") as raised:
+            ask()
+        assert "\n" not in str(raised.value)
+    assert weights_for("resnet50").name == "resnet50-imagenet1k-v2"

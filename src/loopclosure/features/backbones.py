@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -26,7 +26,7 @@ import numpy.typing as npt
 import torch
 from torch import nn
 
-from loopclosure.errors import ConfigError, did_you_mean
+from loopclosure.errors import ConfigError, WeightsError, did_you_mean
 from loopclosure.features.checkpoints import load_strictly, read_checkpoint
 from loopclosure.images.preprocess import Preprocessing
 from loopclosure.weights import Progress, Weights, file_sha256, locate, weights_for
@@ -51,12 +51,24 @@ class Architecture:
         Names of the taps in the same order.
     heads : tuple of str
         Children that only classify; their weights are not wanted.
+    variants : dict of str to callable
+        What turns the network into one that is told by its weights alone, by the name of the variant.
     """
 
     build: Callable[[int, int], nn.Module]
     cut: Callable[[nn.Module], Sequence[nn.Module]]
     layers: tuple[str, ...]
     heads: tuple[str, ...]
+    variants: dict[str, Callable[[nn.Module], None]] = field(default_factory=dict)
+
+    def network(self, height: int, width: int, variant: str = "") -> nn.Module:
+        """Build the whole network in one of its variants, in evaluation mode."""
+        network = self.build(height, width).eval()
+        if variant:
+            if variant not in self.variants:
+                raise WeightsError(f"the weights are for an unknown variant '{variant}' of the network")
+            self.variants[variant](network)
+        return network
 
 
 def _torchvision(name: str, **options: bool) -> Callable[[int, int], nn.Module]:
@@ -85,6 +97,20 @@ def _cut_resnet(net: nn.Module) -> Sequence[nn.Module]:
     return [nn.Sequential(net.conv1, net.bn1, net.relu, net.maxpool), net.layer1, net.layer2, net.layer3, net.layer4]
 
 
+def _resnet_of_caffe(net: nn.Module) -> None:
+    """Put the stride where He et al. have it, into the first convolution of a block, and pool as Caffe does."""
+    net.maxpool = nn.MaxPool2d(3, stride=2, ceil_mode=True)
+    for stage in (net.layer2, net.layer3, net.layer4):
+        stage[0].conv1.stride, stage[0].conv2.stride = stage[0].conv2.stride, stage[0].conv1.stride
+
+
+def _pools_of_caffe(net: nn.Module) -> None:
+    """Round the size of pooled maps up."""
+    for module in net.features:
+        if isinstance(module, nn.MaxPool2d):
+            module.ceil_mode = True
+
+
 def _cut_googlenet(net: nn.Module) -> Sequence[nn.Module]:
     parts = (
         (net.conv1, net.maxpool1),
@@ -111,11 +137,14 @@ def _cut_after(*convolutions: int) -> Callable[[nn.Module], Sequence[nn.Module]]
 
 BACKBONES: dict[str, Architecture] = {
     "efficientnet-lite0": Architecture(_efficientnet_lite0, _cut_efficientnet, ("s4", "s8", "s16", "s32"), ("_fc",)),
+    **{name: Architecture(_torchvision(name), _cut_resnet, _CONV, ("fc",)) for name in ("resnet18", "resnet34")},
     **{
-        name: Architecture(_torchvision(name), _cut_resnet, _CONV, ("fc",))
-        for name in ("resnet18", "resnet34", "resnet50", "resnet101", "resnet152")
+        name: Architecture(_torchvision(name), _cut_resnet, _CONV, ("fc",), {"caffe": _resnet_of_caffe})
+        for name in ("resnet50", "resnet101", "resnet152")
     },
-    "vgg16": Architecture(_torchvision("vgg16"), _cut_after(2, 7, 14, 21, 28), _CONV, ("classifier",)),
+    "vgg16": Architecture(
+        _torchvision("vgg16"), _cut_after(2, 7, 14, 21, 28), _CONV, ("classifier",), {"caffe": _pools_of_caffe}
+    ),
     "alexnet": Architecture(_torchvision("alexnet"), _cut_after(0, 3, 6, 8, 10), _CONV, ("classifier",)),
     "googlenet": Architecture(
         _torchvision("googlenet", init_weights=False), _cut_googlenet, _CONV, ("aux1", "aux2", "fc")
@@ -223,7 +252,7 @@ class Backbone:
         self.weights = weights_for(name, weights)
         self.preprocessing = Preprocessing(height, width, self.weights.mean, self.weights.std)
         with torch.device("meta"):  # shapes without numbers: no time, no memory, no random state
-            network = architecture.build(height, width)
+            network = architecture.network(height, width, self.weights.variant)
             chain = TapChain(dict(zip(architecture.layers, architecture.cut(network), strict=True)), self.layers).eval()
             taps = chain(torch.empty(1, 3, height, width))
         self.shapes = {layer: (*tap.shape[2:], tap.shape[1]) for layer, tap in zip(self.layers, taps, strict=True)}
@@ -265,9 +294,12 @@ class Backbone:
         """
         if not len(images):
             return {layer: np.empty((0, *shape), np.float32) for layer, shape in self.shapes.items()}
-        batch = torch.from_numpy(self.preprocessing.batch(images))
+        return self.compute(self.preprocessing.batch(images))
+
+    def compute(self, batch: npt.NDArray[np.float32]) -> dict[str, npt.NDArray[np.float32]]:
+        """Compute the maps of a batch that `preprocessing` made, float32 (n, 3, height, width)."""
         with torch.inference_mode():
-            taps = self.module(batch.to(self.device, memory_format=torch.channels_last))
+            taps = self.module(torch.from_numpy(batch).to(self.device, memory_format=torch.channels_last))
         arrays = (np.ascontiguousarray(tap.permute(0, 2, 3, 1).cpu().numpy()) for tap in taps)
         return dict(zip(self.layers, arrays, strict=True))
 

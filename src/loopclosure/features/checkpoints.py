@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors.torch import load_file
@@ -14,6 +15,8 @@ from torch import nn
 from loopclosure.errors import WeightsError
 
 MAX_FILE_BYTES = 4 << 30
+FOREIGN = (".caffemodel", ".mat")
+"""Files that `loopclosure.features.importing` translates."""
 
 
 def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
@@ -39,7 +42,9 @@ def read_checkpoint(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
     """
     file = Path(path)
     content: Any
-    _check_size(file)
+    check_file(file)
+    if file.suffix in FOREIGN:
+        raise WeightsError(f"{file} is of another program; `loopclosure weights import {file}` makes weights of it")
     try:
         if file.suffix == ".safetensors":
             content = load_file(file)
@@ -78,33 +83,65 @@ def load_strictly(network: nn.Module, state: Mapping[str, torch.Tensor], *, head
     WeightsError
         In one line.
     """
-    skipped = tuple(f"{head}." for head in heads)
-    state = {key: value for key, value in state.items() if not key.startswith(skipped)}
-    wanted = {key: value for key, value in network.state_dict().items() if not key.startswith(skipped)}
-    for key in wanted.keys() - state.keys():
-        if key.endswith(".num_batches_tracked"):
-            state[key] = torch.tensor(0)
-    misshapen = [key for key in wanted.keys() & state.keys() if not _fits(state[key], wanted[key])]
-    faults = {
-        "missing": wanted.keys() - state.keys(),
-        "unexpected": state.keys() - wanted.keys(),
-        "misshapen": misshapen,
-    }
-    if any(faults.values()):
-        raise WeightsError(f"{origin}: {'; '.join(f'{what} {_some(keys)}' for what, keys in faults.items() if keys)}")
+    wanted = without(network.state_dict(), heads)
+    state = without(state, heads)
+    wrong = misfits(wanted, state)
+    if wrong:
+        raise WeightsError(f"{origin}: {wrong}")
     for key, value in state.items():
         if not torch.isfinite(value).all():
             raise WeightsError(f"{origin}: '{key}' holds values that are not finite")
-    fitting = {key: value.to(wanted[key].dtype) for key, value in state.items()}
+    fitting = {key: state.get(key, torch.tensor(0)).to(value.dtype) for key, value in wanted.items()}
     network.load_state_dict(fitting, strict=False, assign=True)  # only the heads are missing now
 
 
-def _check_size(file: Path) -> None:
+class Misfits(NamedTuple):
+    """Names of tensors that keep a state dict from fitting a network; false if there are none."""
+
+    missing: list[str]
+    unexpected: list[str]
+    misshapen: list[str]
+
+    def __bool__(self) -> bool:
+        return self.total > 0
+
+    def __str__(self) -> str:
+        return "; ".join(f"{what} {_some(names)}" for what, names in self._asdict().items() if names)
+
+    @property
+    def total(self) -> int:
+        """How many there are."""
+        return sum(map(len, self))
+
+
+def misfits(wanted: Mapping[str, torch.Tensor], state: Mapping[str, torch.Tensor]) -> Misfits:
+    """Compare names and shapes; counts of training batches need not be there."""
+    missing = [key for key in wanted.keys() - state.keys() if not key.endswith(".num_batches_tracked")]
+    misshapen = [key for key in wanted.keys() & state.keys() if not _fits(state[key], wanted[key])]
+    return Misfits(missing, list(state.keys() - wanted.keys()), misshapen)
+
+
+def without(state: Mapping[str, torch.Tensor], heads: Iterable[str]) -> dict[str, torch.Tensor]:
+    """Return the tensors that belong to no child of these names."""
+    skipped = tuple(f"{head}." for head in heads)
+    return {key: value for key, value in state.items() if not key.startswith(skipped)}
+
+
+def check_file(file: Path) -> None:
+    """Refuse what is no file or too large.
+
+    Raises
+    ------
+    WeightsError
+        In one line.
+    """
     try:
-        size = file.stat().st_size
+        found = file.stat()
     except OSError as error:
         raise WeightsError(f"cannot read weights from {file}: {error.strerror}") from None
-    if size > MAX_FILE_BYTES:
+    if not stat.S_ISREG(found.st_mode):
+        raise WeightsError(f"cannot read weights from {file}: it is not a file")
+    if found.st_size > MAX_FILE_BYTES:
         raise WeightsError(f"{file} is larger than {MAX_FILE_BYTES} bytes: it holds no weights of these networks")
 
 

@@ -49,10 +49,11 @@ def run(lap, tmp_path_factory):
 def test_a_run(call, run, tmp_path):
     code, text, _ = call(run, "--query", 7, "--out", tmp_path)
     assert code == 0
-    assert text.startswith("3 pictures; look at ")
+    assert text.startswith("4 pictures; look at ")
     assert {file.name for file in tmp_path.iterdir()} == {
         "explain.html",
         "heat_000007_000007.png",
+        "geometry_000007_000007.png",
         "clusters_000007_000007.png",
         "spectrum.png",
     }
@@ -68,7 +69,7 @@ def test_json_lists_the_pictures(call, lap, tmp_path):
     assert code == 0
     found = json.loads(text)
     assert found["page"] == str(tmp_path / "explain.html")
-    assert len(found["pictures"]) == 3
+    assert len(found["pictures"]) == 4
 
 
 @pytest.mark.parametrize("wrong", [["nowhere.png"], ["--method", "seqslam"], ["--query", "99"], ["--query", "0"]])

@@ -178,7 +178,7 @@ def numbers_of(page):
 def test_a_run_is_explained_with_the_descriptors_that_it_used(run, tmp_path):
     done = explain_run(run, tmp_path / "out", most=2)
     page = done.page.read_text()
-    assert len(done.pictures) == 2 * len(numbers_of(page)) + 1
+    assert len(done.pictures) == 3 * len(numbers_of(page)) + 1
     assert all(file.read_bytes().startswith(b"\x89PNG") for file in done.pictures)
     assert set(re.findall(r'src="(.{15})', page)) == {"data:image/png;"}
     assert "http:" not in page
@@ -208,7 +208,7 @@ def test_one_image_and_two_images(folder, tmp_path):
     done = explain_images(
         files[:2], tmp_path, config=Config().with_settings(settings | {"compression.reading": "none"})
     )
-    assert [file.name for file in done.pictures] == ["heat_images.png", "clusters_images.png"]
+    assert [file.name for file in done.pictures] == ["heat_images.png", "geometry_images.png", "clusters_images.png"]
     with pytest.raises(ImageError, match="3 images given"):
         explain_images(files[:3], tmp_path)
     with pytest.raises(FitError, match="learned on the images shown"):

@@ -27,8 +27,10 @@ from loopclosure.report.overlays import draw_clusters, draw_heat
 from loopclosure.report.pairs import Pair, spread
 from loopclosure.report.spectrum import kl_spectrum
 from loopclosure.report.style import png
+from loopclosure.report.verification import draw_verification
 from loopclosure.runs import MODEL, RUN, RunProgress, write_whole
 from loopclosure.store import HEADER
+from loopclosure.verification import Verifier
 
 PAGE = "explain.html"
 MAX_INFO_BYTES = 1 << 26
@@ -226,7 +228,7 @@ def _frame(images: Frames, position: int) -> np.ndarray:
 def _draw(
     out: Path, explainer: Explainer, views: Sequence[View], names: Sequence[str], said: str, suffix: str
 ) -> list[_Plate]:
-    """Draw one image or a pair: heat maps with matches, and clusters."""
+    """Draw one image or a pair: heat maps with matches, local features that agree with one motion, and clusters."""
     first, last = views[0], views[-1]
     heats = [explainer.heat(view, other) for view, other in zip(views, reversed(views), strict=True)]
     title, text = names[0], f"{said}The heat is what each position adds to the descriptor."
@@ -236,10 +238,16 @@ def _draw(
         title = " and ".join(names)
         alike = cosine(first, last)
         text = f"{said}Score of the two frames alone {(1 + alike) / 2:.3f}, from a cosine of {alike:.3f}."
-    return [
-        _plate(out, f"heat_{suffix}.png", title, text, draw_heat(views, heats, names, pairs)),
-        _plate(out, f"clusters_{suffix}.png", "", "", draw_clusters(views, names)),
-    ]
+    plates = [_plate(out, f"heat_{suffix}.png", title, text, draw_heat(views, heats, names, pairs))]
+    if len(views) > 1:
+        plates.append(_plate(out, f"geometry_{suffix}.png", "", "", _geometry(first.image, last.image, names)))
+    return [*plates, _plate(out, f"clusters_{suffix}.png", "", "", draw_clusters(views, names))]
+
+
+def _geometry(query: np.ndarray, match: np.ndarray, names: Sequence[str]) -> Figure:
+    verifier = Verifier("strict")
+    found = verifier.verify(verifier.features(query), verifier.features(match))
+    return draw_verification(query, match, found, (names[0], names[-1]))
 
 
 def _plate(out: Path, file: str, title: str, text: str, figure: Figure) -> _Plate:

@@ -1,0 +1,27 @@
+"""Candidates to loops: does one camera motion explain what two images have in common?
+
+    local_features.py   what is kept of an image       matching.py   features to pairs of points
+    geometry.py         pairs of points to a motion    verifier.py   Verifier: all of it, and the rule
+
+>>> from loopclosure.verification import Verifier
+>>> verifier = Verifier("strict")
+>>> verifier.verify(verifier.features(evening), verifier.features(morning)).verified  # doctest: +SKIP
+True
+"""
+
+from loopclosure.verification.geometry import Motion, fit_geometry, relative_motion
+from loopclosure.verification.local_features import LocalFeatures
+from loopclosure.verification.verifier import GRID, MODES, Verification, VerificationMode, Verifier, cells
+
+__all__ = [
+    "GRID",
+    "MODES",
+    "LocalFeatures",
+    "Motion",
+    "Verification",
+    "VerificationMode",
+    "Verifier",
+    "cells",
+    "fit_geometry",
+    "relative_motion",
+]

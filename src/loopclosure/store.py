@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,12 @@ from loopclosure.weights import file_sha256
 
 FORMAT = 1
 HEADER, ARRAYS = "header.json", "arrays.safetensors"
+TRAINED = "backbone.safetensors"
+"""Weights of a trained network; a saved folder carries its own copy, so that it can be moved."""
+EXPORTED = "bundle.json"
+"""Says what an exported network consists of; a saved folder carries its own copy of that too."""
+EXPORTED_FILES = ("network.xml", "network.bin", "network.onnx", "network.json")
+_CARRIED = {TRAINED: (TRAINED,), EXPORTED: (*EXPORTED_FILES, EXPORTED)}
 MAX_HEADER_BYTES = 1 << 20
 
 
@@ -114,6 +121,23 @@ def part(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
 
 
 def saved_config(header: Mapping[str, Any], folder: str | os.PathLike[str]) -> Config:
-    """Return the configuration that a header holds."""
+    """Return the configuration that a header holds; a trained or exported network is the one in `folder`."""
     with damaged_is_an_error(folder):
-        return Config.from_dict(header["config"])
+        config = Config.from_dict(header["config"])
+        if config.features.weights in _CARRIED:
+            config = config.with_settings({"features.weights": str(Path(folder).resolve() / config.features.weights)})
+        return config
+
+
+def carry_weights(config: Config, folder: str | os.PathLike[str]) -> Config:
+    """Copy a trained or exported network into `folder`, if there is one; return the configuration that names it so."""
+    source, target = Path(config.features.weights), Path(folder)
+    if source.name not in _CARRIED:
+        return config
+    if source.parent.resolve() != target.resolve():
+        target.mkdir(parents=True, exist_ok=True)
+        for name in _CARRIED[source.name]:
+            part = target / f"{name}.part"
+            shutil.copyfile(source.with_name(name), part)
+            os.replace(part, target / name)
+    return config.with_settings({"features.weights": source.name})

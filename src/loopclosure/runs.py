@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
+import logging
 import os
 import platform
 import shutil
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
@@ -23,15 +21,24 @@ from loopclosure import __version__
 from loopclosure.config import Config
 from loopclosure.detect import LoopDetector
 from loopclosure.errors import ConfigError, ImageError
-from loopclosure.evaluation.log import LOOPS_FILE, LOOPS_HEADER
 from loopclosure.images.sequence import ImageSequence
 from loopclosure.records import Decision, Reason
+from loopclosure.runfiles import (
+    SCORES,
+    Checkpoint,
+    LoopFile,
+    RunState,
+    ScoreFile,
+    Stopped,
+    run_identity,
+    stop_between_frames,
+)
 from loopclosure.store import HEADER
 
-RUN, SCORES, MODEL = "run.json", "scores.npy", "model"
+RUN, MODEL = "run.json", "model"
 _DERIVED = (SCORES, "metrics.json", "precision_recall.png", "report.html")  # of results that are about to be replaced
-_PACKAGES = ("numpy", "opencv-python-headless", "scikit-learn", "torch", "torchvision")
-_THUMBNAIL = 800  # largest side of the score matrix that a run keeps in memory
+_PACKAGES = ("numpy", "opencv-python-headless", "openvino", "scikit-learn", "torch", "torchvision")
+_log = logging.getLogger(__name__)
 
 RunProgress = Callable[[str, int, int], None]
 """``progress(stage, done, total)``."""
@@ -72,6 +79,7 @@ def detect_loops(
     model: str | os.PathLike[str] | None = None,
     save_scores: bool = False,
     save_detector: str | os.PathLike[str] | None = None,
+    resume: bool = False,
     progress: RunProgress | None = None,
 ) -> Run:
     """Find the loops of a sequence, alone or against a reference traverse, and write the run folder.
@@ -90,6 +98,10 @@ def detect_loops(
         Also write ``scores.npy``.
     save_detector : path, optional
         Folder for the detector as it stands after the last frame.
+    resume : bool
+        Go on with the run in `out` that was interrupted: with the same arguments it ends as if nothing had happened.
+        Ctrl-C and errors save the state after the last whole frame; a run that was killed goes on from a state that is
+        about a minute old, and one that has none yet begins again.
     progress : callable, optional
         ``progress(stage, done, total)``.
 
@@ -102,39 +114,72 @@ def detect_loops(
     LoopClosureError
         If an image, a setting, the weights or the model cannot be used.
     """
-    started = time.perf_counter()
     report = progress or (lambda *_: None)
     images = _open(source, config or Config())
     if len(images) < 2:
         raise ImageError(f"{source} holds one image; a loop needs at least two frames")
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    _forget_earlier_results(folder)
-    detector, reference_images = _make_detector(reference, config, model, report)
-    columns = len(images) if detector.one_stream else detector.map_size
-    matrix = _Thumbnail(len(images), columns)
-    decisions = []
-    with _ScoreFile(folder / SCORES, wanted=save_scores) as score_file:
-        for decision in detector.detect(images):
-            decisions.append(decision)
-            matrix.add(decision.query, detector.scores)
-            score_file.add(detector.scores)
-            report("finding loops", len(decisions), len(images))
-        score_file.finish(len(decisions) if detector.one_stream else columns)
-    write_loops(folder / LOOPS_FILE, decisions)
-    seconds = detector.seconds | {"total": time.perf_counter() - started}
-    info = describe_run(detector, seconds) | {
+    checkpoint = Checkpoint(folder, run_identity(source, reference, config, save_scores=save_scores))
+    if resume:
+        state = checkpoint.load(images)
+    else:
+        _forget_earlier_results(folder)
+        checkpoint.remove()
+        state = None
+    if state is None:
+        state = RunState(_make_detector(reference, config, model, report), len(images))
+    detector = state.detector
+    with (
+        LoopFile(folder, keep=detector.frames) as loops,
+        ScoreFile(folder, state.lengths, wanted=save_scores) as scores,
+    ):
+        _go_through(images, state, loops, scores, checkpoint, report)
+        scores.finish(len(loops.decisions) if detector.one_stream else detector.map_size)
+        loops.finish()
+    info = describe_run(detector, state.seconds) | {
         "source": str(source),
         "reference": None if reference is None else str(reference),
-        "frames": len(decisions),
-        "references": None if detector.one_stream else columns,
+        "frames": len(loops.decisions),
+        "references": None if detector.one_stream else detector.map_size,
     }
     write_whole(folder / RUN, json.dumps(info, indent=2) + "\n")
     if detector.learned_on:
         detector.save_model(folder / MODEL)
     if save_detector is not None:
         detector.save(save_detector)
-    return Run(folder, tuple(decisions), info, matrix.cells, images, images if reference is None else reference_images)
+    checkpoint.remove()
+    others = images if reference is None else None if _is_detector(reference) else _open(reference, detector.config)
+    return Run(folder, tuple(loops.decisions), info, state.matrix.cells, images, others)
+
+
+def _go_through(
+    images: ImageSequence,
+    state: RunState,
+    loops: LoopFile,
+    scores: ScoreFile,
+    checkpoint: Checkpoint,
+    report: RunProgress,
+) -> None:
+    """Decide the frames that are left; save the state now and then, and where something comes between two frames."""
+    detector = state.detector
+    try:
+        with stop_between_frames() as stop_if_asked:
+            for decision in detector.detect(images.after(detector.frames)):
+                state.matrix.add(decision.query, detector.scores)
+                scores.add(detector.scores)
+                loops.add(decision)
+                report("finding loops", len(loops.decisions), len(images))
+                stop_if_asked()
+                if checkpoint.due():
+                    scores.flush()
+                    checkpoint.save(state, images)
+    except (Exception, Stopped):
+        if 0 < detector.frames == len(loops.decisions):  # else a frame is half done, and the last state counts
+            scores.flush()
+            checkpoint.save(state, images)
+            _log.warning("stopped after %d frames; `detect --resume` goes on from there", detector.frames)
+        raise
 
 
 def fit_model(
@@ -176,17 +221,6 @@ def summarise(run: Run) -> dict[str, Any]:
     }
 
 
-def write_loops(path: Path, decisions: Iterable[Decision]) -> None:
-    """Write ``loops.csv``: one row a frame, in order; match and score are empty where there is no candidate."""
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(LOOPS_HEADER)
-    for item in decisions:
-        score = "" if item.score is None else f"{item.score:.6f}"
-        writer.writerow([item.query, item.match, score, str(item.accepted).lower(), item.inliers, item.reason])
-    write_whole(path, text.getvalue())
-
-
 def describe_run(detector: LoopDetector, seconds: Mapping[str, float]) -> dict[str, Any]:
     """Return what made a result: settings, weights, what was learned on what, versions, machine, time."""
     return {
@@ -221,19 +255,21 @@ def _make_detector(
     config: Config | None,
     model: str | os.PathLike[str] | None,
     report: RunProgress,
-) -> tuple[LoopDetector, ImageSequence | None]:
-    if reference is not None and (Path(reference) / HEADER).is_file():
+) -> LoopDetector:
+    if reference is not None and _is_detector(reference):
         if model is not None:
             raise ConfigError(f"{reference} is a saved detector and brings its own model; leave --model out")
         detector = LoopDetector.load(reference)
         detector.use_map_as_reference(config)
-        return detector, None
+        return detector
     detector = LoopDetector(config, model=model, progress=partial(report, "downloading weights"))
-    if reference is None:
-        return detector, None
-    images = _open(reference, detector.config)
-    detector.set_reference(images, progress=partial(report, "reading the reference"))
-    return detector, images
+    if reference is not None:
+        detector.set_reference(_open(reference, detector.config), progress=partial(report, "reading the reference"))
+    return detector
+
+
+def _is_detector(reference: str | os.PathLike[str]) -> bool:
+    return (Path(reference) / HEADER).is_file()
 
 
 def _open(source: str | os.PathLike[str], config: Config) -> ImageSequence:
@@ -245,59 +281,3 @@ def _forget_earlier_results(folder: Path) -> None:
     for name in _DERIVED:
         (folder / name).unlink(missing_ok=True)
     shutil.rmtree(folder / MODEL, ignore_errors=True)
-
-
-class _Thumbnail:
-    """The score matrix at a bounded size: the largest score of each cell.
-
-    The length of a video is an estimate, so rows and columns beyond it are dropped here; ``scores.npy`` has them all.
-    """
-
-    def __init__(self, rows: int, columns: int) -> None:
-        self._step = -(-max(rows, columns) // _THUMBNAIL)
-        self.cells = np.full((-(-rows // self._step), -(-columns // self._step)), np.nan, np.float32)
-
-    def add(self, row: int, scores: np.ndarray) -> None:
-        if scores.size and row // self._step < len(self.cells):
-            largest = np.fmax.reduceat(scores, np.arange(0, scores.size, self._step))[: self.cells.shape[1]]
-            cells = self.cells[row // self._step, : largest.size]
-            np.fmax(cells, largest, out=cells)
-
-
-class _ScoreFile:
-    """Writes ``scores.npy`` row by row; the file appears when all rows are there."""
-
-    def __init__(self, path: Path, *, wanted: bool) -> None:
-        self._path, self._wanted = path, wanted
-        self._rows_path, self._part = path.with_name(f"{path.name}.rows"), path.with_name(f"{path.name}.part")
-        self._lengths: list[int] = []
-
-    def __enter__(self) -> _ScoreFile:
-        self._rows = open(self._rows_path, "wb") if self._wanted else None
-        return self
-
-    def add(self, scores: np.ndarray) -> None:
-        """Take the next row; in one stream rows grow."""
-        if self._rows is not None:
-            self._lengths.append(scores.size)
-            self._rows.write(scores.astype(np.float32).tobytes())
-
-    def finish(self, columns: int) -> None:
-        """Put the rows into one matrix, NaN where a row is shorter."""
-        if self._rows is None:
-            return
-        self._rows.flush()
-        shape = (len(self._lengths), columns)
-        matrix = np.lib.format.open_memmap(self._part, mode="w+", dtype=np.float32, shape=shape)
-        with open(self._rows_path, "rb") as rows:
-            for row, length in enumerate(self._lengths):
-                matrix[row, :length] = np.frombuffer(rows.read(4 * length), np.float32)
-                matrix[row, length:] = np.nan
-        matrix.flush()
-        os.replace(self._part, self._path)
-
-    def __exit__(self, *_: object) -> None:
-        if self._rows is not None:
-            self._rows.close()
-        for path in (self._rows_path, self._part):
-            path.unlink(missing_ok=True)

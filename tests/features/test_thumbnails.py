@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.fft import dctn
 
 from loopclosure.errors import ConfigError, ImageError
-from loopclosure.features.thumbnails import grey_thumbnail, normalise_patches, thumbnails
+from loopclosure.features.thumbnails import grey_thumbnail, low_frequencies, normalise_patches, thumbnails
 
 
 def plain_patches(grey: np.ndarray, side: int) -> np.ndarray:
@@ -122,3 +123,15 @@ def test_photographs_become_what_openseqslam_was_given_and_what_it_made_of_it(
         ours = grey_thumbnail(np.asarray(Image.open(path).convert("RGB")))
         # JPEG decoders differ by a level or two here and there.
         assert np.abs(ours.astype(int) - grey).mean() < 0.25
+
+
+def test_low_frequencies_are_coefficients_of_the_cosine_transform():
+    stack = np.random.default_rng(0).normal(size=(2, 8, 12)).astype(np.float32)
+    low = [(u, v) for u in range(4) for v in range(4) if 0 < u + v <= 3]
+    wanted = []
+    for thumbnail in stack:
+        corners = [(top, left) for top in (0, 4) for left in (0, 4, 8)]
+        blocks = [dctn(thumbnail[top : top + 4, left : left + 4], norm="ortho") for top, left in corners]
+        wanted.append([block[u, v] for block in blocks for u, v in low])
+    np.testing.assert_allclose(low_frequencies(stack), wanted, atol=1e-5)
+    assert low_frequencies(stack[:0]).shape == (0, 54)

@@ -27,6 +27,9 @@ def detect(
     save_detector: Annotated[
         Path | None, typer.Option(help="Folder for the detector and its map, for a later --reference.")
     ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the run in OUT that was interrupted, by Ctrl-C too.")
+    ] = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -39,6 +42,8 @@ def detect(
       loopclosure detect evening/ --reference morning/ --out run --save-scores
 
       loopclosure detect drive.mp4 --sequence-length 5 --threshold 0.62
+
+      loopclosure detect drive/images --out run --resume
     """
     from loopclosure.report import write_report
     from loopclosure.runs import detect_loops, summarise
@@ -52,6 +57,7 @@ def detect(
             model=model,
             save_scores=save_scores,
             save_detector=save_detector,
+            resume=resume,
             progress=progress,
         )
         page = write_report(run)

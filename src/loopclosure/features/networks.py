@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+import os
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from loopclosure.config import Config
 from loopclosure.errors import ConfigError
-from loopclosure.weights import Progress
+from loopclosure.store import EXPORTED
+from loopclosure.weights import DEFAULTS, Progress
+
+if TYPE_CHECKING:
+    from loopclosure.images.preprocess import Preprocessing
 
 
 class MapNetwork(Protocol):
@@ -23,6 +29,10 @@ class MapNetwork(Protocol):
     def weights_sha256(self) -> str | None:
         """Digest of their file; None for random weights."""
 
+    @property
+    def preprocessing(self) -> Preprocessing:
+        """Images to the input of the network."""
+
     def maps(self, images: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
         """Turn n uint8 RGB images (h, w, 3) into float32 (n, h, w, c) by the name of the layer."""
 
@@ -33,7 +43,9 @@ def open_network(config: Config, *, progress: Progress | None = None) -> MapNetw
     Parameters
     ----------
     config : Config
-        ``features.backbone`` is a name of `loopclosure.features.backbones.BACKBONES`, or ``onnx``.
+        ``features.backbone`` is a name of `loopclosure.features.backbones.BACKBONES`, or ``onnx``;
+        ``features.backend`` says what executes it. Weights that are the file ``bundle.json`` of an exported network
+        run without torch.
     progress : callable, optional
         Told ``(arrived, in_all)`` bytes while weights are downloaded.
 
@@ -52,13 +64,42 @@ def open_network(config: Config, *, progress: Progress | None = None) -> MapNetw
                 "the output that its JSON names"
             )
         return OnnxNetwork(config.onnx.path)
+    if os.path.basename(features.weights) == EXPORTED:
+        from loopclosure.features.exported import open_exported
+
+        return open_exported(features)
+    try:
+        return _runtime(features.backend, features.backbone)(
+            features.backbone,
+            features.layer,
+            weights=features.weights,
+            height=features.height,
+            width=features.width,
+            progress=progress,
+        )
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise ConfigError(
+            f"the network {features.backbone} is read by torch, which is not installed; pip install torch torchvision, "
+            "or run a bundle that `loopclosure export` made where torch is"
+        ) from None
+
+
+def _runtime(backend: str, backbone: str) -> Callable[..., MapNetwork]:
+    """Return what executes a backbone: OpenVINO where it is installed, else torch, on a GPU if there is one."""
+    if backend != "torch" and backbone in DEFAULTS:  # torch knows best what to say of an unknown backbone
+        try:
+            from loopclosure.features.openvino_runtime import OpenVinoBackbone, import_openvino
+
+            import_openvino()
+        except ImportError as error:
+            if backend == "openvino":
+                raise ConfigError(f"features.backend = openvino: {error}; pip install openvino") from None
+        else:
+            return OpenVinoBackbone
+    import torch
+
     from loopclosure.features.backbones import Backbone
 
-    return Backbone(
-        features.backbone,
-        features.layer,
-        weights=features.weights,
-        height=features.height,
-        width=features.width,
-        progress=progress,
-    )
+    return partial(Backbone, device="cuda" if torch.cuda.is_available() else "cpu")

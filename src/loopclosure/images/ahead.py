@@ -1,4 +1,4 @@
-"""Decoding runs ahead of computation."""
+"""Decoding runs ahead of computation, one by one or in batches."""
 
 from __future__ import annotations
 
@@ -43,3 +43,28 @@ def read_ahead(items: Iterable[T], depth: int = 8) -> Iterator[T]:
             yield item  # type: ignore[misc]
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def in_batches(items: Iterable[T], size: int) -> Iterator[list[T]]:
+    """Put `items` together into lists of `size`; the last one may be shorter.
+
+    Where `items` raises, what came before is yielded first.
+
+    Examples
+    --------
+    >>> list(in_batches(range(5), 2))
+    [[0, 1], [2, 3], [4]]
+    """
+    batch: list[T] = []
+    try:
+        for item in items:
+            batch.append(item)
+            if len(batch) == size:
+                yield batch
+                batch = []
+    except Exception:
+        if batch:
+            yield batch
+        raise
+    if batch:
+        yield batch

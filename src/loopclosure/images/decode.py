@@ -47,7 +47,9 @@ _FORMATS: dict[bytes, type[ImageFile]] = {
 _BITS_PER_SAMPLE = 258  # TIFF tag
 
 
-def read_image(path: str | os.PathLike[str], *, max_megapixels: float = 64.0) -> Image:
+def read_image(
+    path: str | os.PathLike[str], *, max_megapixels: float = 64.0, at_least: tuple[int, int] | None = None
+) -> Image:
     """Read one JPEG, PNG, BMP, TIFF or WebP file.
 
     Parameters
@@ -56,6 +58,9 @@ def read_image(path: str | os.PathLike[str], *, max_megapixels: float = 64.0) ->
         The file; its content decides how it is read, not its name.
     max_megapixels : float
         A larger image is refused by its header, before memory is taken for it.
+    at_least : tuple of 2 int, optional
+        Height and width, pixels, to which the image is going to be shrunk. A JPEG may then be decoded at a half, a
+        quarter or an eighth of its size, each pixel the mean of those it stands for, but no smaller than this.
 
     Returns
     -------
@@ -73,6 +78,8 @@ def read_image(path: str | os.PathLike[str], *, max_megapixels: float = 64.0) ->
         _check_file(file)
         with file.open("rb") as stream, _opened(file, stream) as image:
             _check_size(file, image.width, image.height, max_megapixels)
+            if at_least is not None and isinstance(image, JpegImageFile):
+                image.draft(None, (max(at_least),) * 2)  # a square, because EXIF may turn it
             image.load()
             ImageOps.exif_transpose(image, in_place=True)
             return _rgb(file, image)

@@ -55,6 +55,11 @@ class Preprocessing:
                 raise ConfigError(f"{name} = {values}: wanted three finite numbers{' above 0' * (name == 'std')}")
             object.__setattr__(self, name, values)
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.height, self.width
+
     def __call__(self, image: Image) -> npt.NDArray[np.float32]:
         """Prepare one image.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import os
 import re
@@ -70,6 +71,22 @@ class ImageSequence:
             raise ConfigError(f"on_error = {on_error!r}: wanted 'stop' or 'skip'")
         self.source = Path(source)
         self._frames = _open(self.source, on_error == "skip", max_megapixels)
+        self._start = 0
+
+    def reduced(self, height: int, width: int) -> ImageSequence:
+        """Return the same frames for a reader who shrinks them to `height` x `width` pixels or more.
+
+        JPEG files are then decoded at a fraction of their size where that is enough, which is several times faster.
+        """
+        other = copy.copy(self)
+        other._frames = self._frames.reduced((height, width))
+        return other
+
+    def after(self, count: int) -> ImageSequence:
+        """Return the frames without the first `count`; those of a video are passed over, not decoded."""
+        other = copy.copy(self)
+        other._start += count
+        return other
 
     @property
     def is_video(self) -> bool:
@@ -79,19 +96,19 @@ class ImageSequence:
     @property
     def names(self) -> list[str]:
         """One name a frame."""
-        return self._frames.names
+        return self._frames.names[self._start :]
 
     def __len__(self) -> int:
         """Return the number of frames; of a video see the notes."""
-        return len(self._frames.names)
+        return max(0, len(self._frames.names) - self._start)
 
     def __iter__(self) -> Iterator[Image | None]:
         """Start at the first frame."""
-        return iter(self._frames)
+        return self._frames.iterate(self._start)
 
     def __getitem__(self, position: int) -> Image | None:
         """Return frame `position`; None if it is unreadable and `on_error` is ``skip``."""
-        return self._frames.read(range(len(self))[index(position)])
+        return self._frames.read(self._start + range(len(self))[index(position)])
 
     def __repr__(self) -> str:
         """Name the source and its length."""
@@ -110,27 +127,39 @@ def frames_of(
 class _Frames(Protocol):
     names: list[str]
 
-    def __iter__(self) -> Iterator[Image | None]: ...
+    def iterate(self, start: int) -> Iterator[Image | None]: ...
 
     def read(self, where: int) -> Image | None: ...
 
+    def reduced(self, at_least: tuple[int, int]) -> _Frames: ...
+
 
 class _Files:
-    def __init__(self, files: Sequence[Path], names: list[str], skip: bool, max_megapixels: float) -> None:
+    def __init__(
+        self,
+        files: Sequence[Path],
+        names: list[str],
+        skip: bool,
+        max_megapixels: float,
+        at_least: tuple[int, int] | None = None,
+    ) -> None:
         self.names = names
-        self._files, self._skip, self._max_megapixels = files, skip, max_megapixels
+        self._files, self._skip, self._max_megapixels, self._at_least = files, skip, max_megapixels, at_least
 
-    def __iter__(self) -> Iterator[Image | None]:
-        return map(self.read, range(len(self._files)))
+    def iterate(self, start: int) -> Iterator[Image | None]:
+        return map(self.read, range(start, len(self._files)))
 
     def read(self, where: int) -> Image | None:
         try:
-            return read_image(self._files[where], max_megapixels=self._max_megapixels)
+            return read_image(self._files[where], max_megapixels=self._max_megapixels, at_least=self._at_least)
         except ImageError as error:
             if not self._skip:
                 raise
             _log.warning("frame %d is skipped: %s", where, error)
             return None
+
+    def reduced(self, at_least: tuple[int, int]) -> _Files:
+        return _Files(self._files, self.names, self._skip, self._max_megapixels, at_least)
 
 
 class _Video:
@@ -153,9 +182,9 @@ class _Video:
             self.names = _frame_names(announced)
             self._slack = min(max(1.0, capture.get(cv2.CAP_PROP_FPS)), 60.0)
 
-    def __iter__(self) -> Iterator[Image | None]:
-        found = 0
+    def iterate(self, start: int) -> Iterator[Image | None]:
         with self._capture() as capture:
+            found = sum(capture.grab() for _ in range(start))
             while (frame := capture.read()[1]) is not None:
                 found += 1
                 yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
@@ -180,6 +209,9 @@ class _Video:
         if not self._skip:
             raise ImageError(f"{self._file}: frame {where} cannot be decoded; is the video cut short?")
         return None
+
+    def reduced(self, at_least: tuple[int, int]) -> _Video:  # noqa: ARG002  (a decoder of videos knows one size)
+        return self
 
     @contextmanager
     def _capture(self) -> Iterator[cv2.VideoCapture]:

@@ -15,9 +15,12 @@ SOURCE = Path(loopclosure.__file__).parent
 STAGES = ("images", "features", "compression", "aggregation", "matching", "verification")
 SHARED = {"records", "errors", "config", "weights", "store", "timing"}
 ABOVE = {
+    "bundle",
+    "decision",
     "detect",
     "traverse",
     "warmup",
+    "runfiles",
     "runs",
     "methods",
     "training",
@@ -63,6 +66,12 @@ def test_a_stage_imports_only_shared_modules_and_earlier_stages(stage):
     files = [*SOURCE.glob(f"{stage}.py"), *SOURCE.glob(f"{stage}/**/*.py")]
     wrong = [(str(file), part) for file in files for part in imported_parts(file) if part not in allowed]
     assert not wrong
+
+
+def test_training_imports_no_later_stage():
+    allowed = SHARED | set(STAGES) | {"training", "methods", "evaluation", "__version__"}
+    wrong = [(str(file), part) for file in SOURCE.glob("training/*.py") for part in imported_parts(file)]
+    assert not [(file, part) for file, part in wrong if part not in allowed]
 
 
 def test_every_module_belongs_to_the_layout():

@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -46,6 +46,9 @@ class Features(Section):
     weights: str = Field("default", description="'default', a name, a path, or 'random'")
     height: int = Field(224, ge=32, le=2048, description="input height, pixels")
     width: int = Field(224, ge=32, le=2048, description="input width, pixels")
+    backend: Literal["auto", "openvino", "torch"] = Field(
+        "auto", description="what executes the network; auto = openvino where it is installed"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -60,7 +63,9 @@ class Compression(Section):
     """The Karhunen-Loeve transform (paper 2.2). One of `gamma`, `energy` and `components` rules."""
 
     reading: Literal["channel", "sequence", "flat", "none"] = Field("channel", description="how Eq. 5-16 are read")
-    gamma: float | None = Field(0.6, ge=0, lt=1, description="share of the eigenvectors that is cut away (Eq. 16)")
+    gamma: Annotated[float, Field(ge=0, lt=1)] | Literal["auto"] | None = Field(
+        0.6, description="share of the eigenvectors that is cut away (Eq. 16); 'auto' chooses it from the images"
+    )
     energy: float | None = Field(None, gt=0, le=1, description="share of the energy that is kept (Eq. 15)")
     components: int | None = Field(None, ge=1, description="number of eigenvectors that is kept")
     whiten: bool = Field(False, description="scale every component to unit variance")
@@ -70,6 +75,8 @@ class Compression(Section):
         given = [name for name in ("gamma", "energy", "components") if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"wants exactly one of gamma, energy and components, found {given or 'none'}")
+        if self.gamma == "auto" and self.reading != "channel":
+            raise ValueError(f"gamma = auto is for the reading 'channel', found '{self.reading}'")
         if self.reading == "sequence" and self.energy is not None:
             raise ValueError("the reading 'sequence' wants gamma or components: by energy, sequences differ in size")
         return self
@@ -81,6 +88,9 @@ class Aggregation(Section):
     clusters: int = Field(64, ge=1, le=4096, description="NetVLAD clusters K")
     centre_window: int = Field(
         60, ge=0, description="frames whose mean descriptor is taken out of each new one; 0 = nothing is taken out"
+    )
+    components: int = Field(
+        64, ge=0, le=4096, description="numbers a descriptor is reduced to, whitened (needs centring); 0 = all are kept"
     )
 
 
@@ -104,6 +114,12 @@ class Sequence(Section):
     length: int = Field(10, ge=1, le=10_000, description="frames l in a sequence")
     exclude_recent: int = Field(30, ge=1, description="in one stream: frames nearer than this are no candidates")
     direction: Literal["forward", "both"] = Field("forward", description="'both' also finds a street driven back")
+
+
+class Index(Section):
+    """How a new frame is compared with a large map."""
+
+    flat_up_to: int = Field(50_000, ge=1000, description="places beyond which short codes are compared first")
 
 
 class SeqSlam(Section):
@@ -133,12 +149,69 @@ class Onnx(Section):
 class Decide(Section):
     """From the best score to a decision."""
 
+    false_loops_per_1000: float = Field(
+        1.0, gt=0, le=1000, description="false loops that are allowed in 1000 frames, where a score is a probability"
+    )
     threshold: float | None = Field(
-        None, description="least score of a loop, where a score is a similarity 1 - D; none = the method's own"
+        None, description="least score of a loop; none = by false_loops_per_1000, or the method's own"
     )
     consistency: int = Field(
-        10, ge=1, description="frames over which the best candidate must have moved on with the robot; 1 = not asked"
+        10,
+        ge=1,
+        description="frames over which the best candidate must have moved on with the robot, where a score is a "
+        "similarity; 1 = not asked",
     )
+
+
+class Verification(Section):
+    """Whether local features confirm a loop."""
+
+    mode: Literal["none", "fast", "strict"] = Field(
+        "fast", description="'strict' keeps twice the local features of 'fast' and lets less that is false pass"
+    )
+    every: int = Field(3, ge=1, le=100, description="local features are kept of every so many frames")
+
+
+class Training(Section):
+    """Gradient training (paper 2.1; Arandjelovic et al. 2016, section 4)."""
+
+    epochs: int = Field(15, ge=0, le=10_000, description="passes over the training images")
+    batch: int = Field(16, ge=1, le=4096, description="pairs, or queries, a step")
+    learning_rate: float | None = Field(None, gt=0, description="of SGD; none = 0.02 for siamese, 1e-4 for netvlad")
+    halve_every: int = Field(5, ge=0, description="epochs after which the learning rate is halved; 0 = never")
+    momentum: float = Field(0.9, ge=0, lt=1, description="of SGD")
+    weight_decay: float = Field(1e-3, ge=0, description="of SGD")
+    patience: int = Field(5, ge=0, description="epochs without a better held-out measure before it stops; 0 = never")
+    held_out: float = Field(0.2, gt=0, lt=1, description="share of the data that measures and is not learned from")
+    freeze_until: str | None = Field(
+        None,
+        description="last layer that stays as it is, or 'nothing'; none = all but the last stage for siamese, "
+        "the whole network for netvlad",
+    )
+    augment: bool = Field(True, description="crop, colour, blur and occluders, drawn anew for each image")
+    distance: Literal["euclidean", "cosine"] = Field("euclidean", description="of the contrastive loss of siamese")
+    margin: float | None = Field(None, gt=0, description="none = 1 for siamese, 0.1 for netvlad")
+    pairs: Literal["drawn", "all", "hardest"] = Field(
+        "all", description="siamese: the pairs drawn, all that are known among their images, or the hardest of these"
+    )
+    negatives: int = Field(10, ge=1, le=1000, description="netvlad: hardest negatives a query")
+    pool: int = Field(1000, ge=1, description="netvlad: negatives drawn for each query, to choose the hardest from")
+    round: int = Field(
+        1000, ge=1, description="pairs, or queries, between checkpoints; netvlad renews there what it mines from"
+    )
+    positive_m: float = Field(10.0, gt=0, description="poses nearer than this are one place, metres")
+    negative_m: float = Field(25.0, gt=0, description="poses farther apart than this are two places, metres")
+    device: str = Field("auto", description="'auto' = a GPU where there is one; or cpu, cuda, cuda:1 ...")
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto", description="bfloat16 is mixed precision; auto = that on a GPU that has it"
+    )
+    seed: int = Field(0, ge=0, description="of what is held out, drawn and augmented")
+
+    @model_validator(mode="after")
+    def _apart(self) -> Training:
+        if self.negative_m < self.positive_m:
+            raise ValueError(f"negative_m = {self.negative_m:g} is less than positive_m = {self.positive_m:g}")
+        return self
 
 
 class Config(Section):
@@ -161,10 +234,13 @@ class Config(Section):
     aggregation: Aggregation = Aggregation()
     learning: Learning = Learning()
     sequence: Sequence = Sequence()
+    index: Index = Index()
     decision: Decide = Decide()
+    verification: Verification = Verification()
     seqslam: SeqSlam = SeqSlam()
     words: Words = Words()
     onnx: Onnx = Onnx()
+    training: Training = Training()
 
     def __init__(self, **values: Any) -> None:
         try:
@@ -174,6 +250,8 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _one_way(self) -> Config:
+        if self.compression.gamma == "auto" and self.method not in ("kl-netvlad", "onnx"):
+            raise ValueError(f"compression.gamma = auto is for the method kl-netvlad, found {self.method}")
         if self.sequence.direction == "both" and self.compression.reading == "sequence":
             raise ValueError(
                 "sequence.direction = both wants another reading than 'sequence': eigen-images have no direction"
@@ -255,6 +333,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "compression.gamma": 0.8,
         "aggregation.clusters": 64,
         "aggregation.centre_window": 0,
+        "aggregation.components": 0,
+        "verification.mode": "none",
         "sequence.length": 10,
         "decision.threshold": 0.7,
         "decision.consistency": 1,
@@ -263,8 +343,12 @@ PRESETS: dict[str, dict[str, Any]] = {
 """Named configurations: settings over the defaults."""
 
 METHOD_SETTINGS: dict[str, dict[str, Any]] = {
-    "netvlad-resnet152": {"features.backbone": "resnet152", "compression.reading": "none"},
-    "netvlad-vgg16": {"features.backbone": "vgg16", "compression.reading": "none"},
+    "netvlad-resnet152": {
+        "features.backbone": "resnet152",
+        "compression.reading": "none",
+        "aggregation.components": 0,
+    },
+    "netvlad-vgg16": {"features.backbone": "vgg16", "compression.reading": "none", "aggregation.components": 0},
     "faster-rcnn": {
         "features.backbone": "fasterrcnn_resnet50_fpn",
         "features.height": 480,
@@ -312,7 +396,7 @@ def _flatten(values: Mapping[str, Any]) -> dict[str, Any]:
 def _parse(name: str, value: Any) -> Any:
     if not isinstance(value, str):
         return value
-    if value.lower() in ("none", "null") and name != "compression.reading":
+    if value.lower() in ("none", "null") and name not in ("compression.reading", "verification.mode"):
         return None
     if name == "learning.refit_at":
         return [part for part in value.replace(",", " ").split() if part]

@@ -5,23 +5,28 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from loopclosure import store
 from loopclosure.config import Config
+from loopclosure.decision import Evidence, Judge, new_views
 from loopclosure.errors import FitError, LoopClosureError, ModelError
-from loopclosure.images.ahead import read_ahead
+from loopclosure.images.ahead import in_batches, read_ahead
 from loopclosure.images.decode import check_image
+from loopclosure.images.sequence import ImageSequence
 from loopclosure.methods import Method, PlaceMap, build_method
 from loopclosure.records import Decision, Reason
 from loopclosure.timing import Stopwatch
 from loopclosure.traverse import Traverse, describe, describe_traverse
+from loopclosure.verification import LocalFeatures, Verifier, Views
 from loopclosure.warmup import WarmUp
 
 _MEAN = "mean_of_fit"  # beside the arrays of a method
+_BATCH = 8  # frames whose features are computed together where frames are not live
 Progress = Callable[[int, int], None]
 
 
@@ -31,6 +36,13 @@ class Frames(Protocol):
     def __len__(self) -> int: ...
     def __iter__(self) -> Iterator[np.ndarray | None]: ...
     def __getitem__(self, index: int, /) -> np.ndarray | None: ...
+
+
+class View(NamedTuple):
+    """What is seen in a frame: features of the method, and, of some frames, local ones; None where it is unreadable."""
+
+    features: np.ndarray | None
+    local: LocalFeatures | None
 
 
 class LoopDetector:
@@ -46,7 +58,7 @@ class LoopDetector:
     config : Config, optional
         All settings; the embedded default, or what `model` was fitted with.
     model : path, optional
-        Folder that `save_model` or ``loopclosure fit`` wrote.
+        Folder that `save_model`, ``loopclosure fit`` or ``loopclosure train`` wrote.
     progress : callable, optional
         ``progress(done, total)`` in bytes, where weights have to be downloaded.
 
@@ -86,7 +98,7 @@ class LoopDetector:
         self.config = _agreed_config(config, header, model)
         self.method: Method = build_method(self.config, progress=progress)
         self.learned_on: list[str] = []
-        self._clock = Stopwatch("features", "learn", "describe", "match")
+        self._clock = Stopwatch("features", "keypoints", "learn", "describe", "match", "decide")
         self.frames: int
         self.scores: np.ndarray
         self._traverse: Traverse
@@ -110,8 +122,17 @@ class LoopDetector:
     @property
     def threshold(self) -> float:
         """Least score of a loop."""
-        chosen = self.config.decision.threshold
-        return self.method.threshold if chosen is None else chosen
+        return self._judge.threshold
+
+    @property
+    def verifier(self) -> Verifier | None:
+        """What verifies candidates; None where nothing is verified."""
+        return None if self._judge.views is None else self._judge.views.verifier
+
+    @property
+    def evidence(self) -> tuple[Evidence, ...]:
+        """What spoke for each candidate of the last frame, best first."""
+        return self._judge.evidence
 
     @property
     def map_size(self) -> int:
@@ -120,8 +141,9 @@ class LoopDetector:
 
     @property
     def map_bytes(self) -> int:
-        """Bytes that the descriptors of the map take."""
-        return self._traverse.places.nbytes
+        """Bytes that the map takes: its descriptors, and the local features that loops are verified by."""
+        views = self._judge.places
+        return self._traverse.places.nbytes + (0 if views is None else views.nbytes)
 
     def add(self, image: np.ndarray | None) -> Decision:
         """Take the next frame and decide.
@@ -143,42 +165,34 @@ class LoopDetector:
         FitError
             If the first frames are too few for the method to be fitted on them.
         """
-        features = self._features(image)
+        return self._step(self._look(image))
+
+    def detect(self, images: Iterable[np.ndarray | None]) -> Iterator[Decision]:
+        """Yield the decision of each frame: what `add` says, frame by frame.
+
+        Where `images` has a length, decoding runs ahead, features are computed in batches, and matching goes on
+        meanwhile; a live source is asked for one image at a time.
+        """
+        if isinstance(images, Sized):
+            frames = enumerate(self._as_needed(images), self.frames)
+            yield from (self._step(view) for _, view in self._look_ahead(frames))
+        else:
+            yield from map(self.add, images)
+
+    def _step(self, view: View) -> Decision:
+        features, readable = view.features, view.features is not None
+        self._judge.see(self.frames, view.local)
         if self._warm_up is not None:
             self._learn(self._warm_up, features)
         query, self.frames = self.frames, self.frames + 1
         if not self.method.fitted:
             self.scores = np.full(query, np.nan, np.float32)
-            return _no_candidate(query, Reason.UNREADABLE if image is None else Reason.WARMING_UP)
+            return Decision(query, None, None, False, None, Reason.WARMING_UP if readable else Reason.UNREADABLE)
         self.scores = self._traverse.step(features)
-        if image is None:
+        if not readable:
             self.scores = np.full_like(self.scores, np.nan)
-        return self._decide(query, readable=image is not None)
-
-    def detect(self, images: Iterable[np.ndarray | None]) -> Iterator[Decision]:
-        """Yield the decision of each frame: `add` frame by frame.
-
-        Decoding runs ahead where `images` has a length; a live source is asked for one image at a time.
-        """
-        for image in read_ahead(images) if isinstance(images, Sized) else images:
-            yield self.add(image)
-
-    def _decide(self, query: int, *, readable: bool) -> Decision:
-        candidates = readable and not np.isnan(self.scores).all()
-        match = int(np.nanargmax(self.scores)) if candidates else None
-        run = self._traverse.consistency.push(match)
-        if match is None:
-            return _no_candidate(query, self._why_none(query) if readable else Reason.UNREADABLE)
-        score = float(self.scores[match])
-        if score < self.threshold:
-            reason = Reason.BELOW_THRESHOLD
-        else:
-            reason = Reason.ACCEPTED if run >= self.config.decision.consistency else Reason.INCONSISTENT
-        return Decision(query, match, score, reason is Reason.ACCEPTED, None, reason)
-
-    def _why_none(self, query: int) -> Reason:
-        old_enough = not self.one_stream or query >= self.config.sequence.exclude_recent
-        return Reason.SEQUENCE_TOO_SHORT if old_enough else Reason.TOO_RECENT
+        with self._clock("decide"):
+            return self._judge.decide(query, self.scores, readable=readable)
 
     def set_reference(self, images: Frames, *, progress: Progress | None = None) -> None:
         """Look for loops against another traverse, and no longer within the drive.
@@ -193,19 +207,26 @@ class LoopDetector:
         """
         seen = {} if self.method.fitted else self._fit_on(images, source="reference traverse", progress=progress)
         recent: deque[np.ndarray] = deque(maxlen=self.method.window)
-        described = []
-        for index, image in enumerate(read_ahead(images)):
-            features = seen[index] if index in seen else self._features(image)
-            described.append(describe(self.method, features, recent))
+        views = new_views(self.config, self.method)
+        places = self.method.new_map(exclude_recent=0)
+        described: list[np.ndarray] = []  # what is centred waits here for the mean of all
+        keep = described.append if self.method.centred else places.add
+        unseen = ((i, None if i in seen else image) for i, image in enumerate(self._as_needed(images)))
+        for index, looked in self._look_ahead(unseen):
+            view = seen.get(index, looked)
+            keep(describe(self.method, view.features, recent))
+            if views is not None and views.wanted(index):
+                views.add(view.local)
             if progress:
                 progress(index + 1, len(images))
-        if not described:
+        if not described and not len(places):
             raise FitError("the reference traverse holds no frame")
-        descriptors, mean = describe_traverse(self.method, self.config, described)
-        places = self.method.new_map(exclude_recent=0)
-        for descriptor in descriptors:
-            places.add(descriptor)
-        self._against(places, prior=mean)
+        mean = None
+        if described:
+            descriptors, mean = describe_traverse(self.method, self.config, described)
+            for descriptor in descriptors:
+                places.add(descriptor)
+        self._against(places, views, prior=mean)
 
     def use_map_as_reference(self, config: Config | None = None) -> None:
         """Start a new traverse whose candidates are the frames of the map, and only those.
@@ -222,7 +243,7 @@ class LoopDetector:
         if not self.map_size:
             raise FitError("the map is empty: add frames before it can serve as a reference")
         places = self.method.new_map(exclude_recent=0).restore(self._traverse.places.to_arrays())
-        self._against(places, prior=self._traverse.mean)
+        self._against(places, self._judge.views, prior=self._traverse.mean)
 
     def fit(self, images: Frames, *, source: str, progress: Progress | None = None) -> None:
         """Fit the method on a traverse, in place of learning from the drive.
@@ -238,24 +259,54 @@ class LoopDetector:
         """
         seen = self._fit_on(images, source=source, progress=progress)
         self._warm_up = None
-        self._mean = self._mean_of(list(seen.values()))
+        self._mean = self._mean_of([view.features for view in seen.values() if view.features is not None])
         self._start(self._new_traverse(prior=self._mean))
 
-    def _features(self, image: np.ndarray | None) -> np.ndarray | None:
+    def _as_needed(self, images: Any) -> Any:
+        """Spare an image sequence the pixels that would be thrown away."""
+        if self.method.input_size is None or not isinstance(images, ImageSequence):
+            return images
+        least = 0 if self._judge.views is None else Verifier.side
+        return images.reduced(*(max(size, least) for size in self.method.input_size))
+
+    def _look(self, image: np.ndarray | None) -> View:
+        return self._look_at([(self.frames, None if image is None else check_image(image))])[0][1]
+
+    def _look_at(self, frames: list[tuple[int, np.ndarray | None]]) -> list[tuple[int, View]]:
+        """Compute the features of several frames, which come with their positions in the drive."""
+        readable = [image for _, image in frames if image is not None]
         with self._clock("features"):
-            return None if image is None else self.method.features([check_image(image)])[0]
+            found = iter(self.method.features(readable) if readable else ())
+        return [
+            (index, View(None, None) if image is None else View(next(found), self._local(index, image)))
+            for index, image in frames
+        ]
+
+    def _local(self, index: int, image: np.ndarray) -> LocalFeatures | None:
+        views = self._judge.views
+        if views is None or not views.wanted(index):
+            return None
+        with self._clock("keypoints"):
+            return views.verifier.features(image)
+
+    def _look_ahead(self, frames: Iterable[tuple[int, np.ndarray | None]]) -> Iterator[tuple[int, View]]:
+        """Yield what is seen in each frame: one thread decodes, one computes in batches, both ahead of the caller."""
+        checked = ((index, None if image is None else check_image(image)) for index, image in frames)
+        batches = in_batches(read_ahead(checked), _BATCH)
+        return chain.from_iterable(read_ahead(map(self._look_at, batches), depth=1))
 
     def _new_traverse(self, *, reference: PlaceMap | None = None, prior: np.ndarray | None = None) -> Traverse:
         return Traverse(self.method, self.config, clock=self._clock, reference=reference, prior=prior)
 
-    def _against(self, places: PlaceMap, *, prior: np.ndarray | None) -> None:
+    def _against(self, places: PlaceMap, views: Views | None, *, prior: np.ndarray | None) -> None:
         self._warm_up = None
-        self._start(self._new_traverse(reference=places, prior=prior))
+        self._start(self._new_traverse(reference=places, prior=prior), views)
 
-    def _start(self, traverse: Traverse) -> None:
+    def _start(self, traverse: Traverse, reference: Views | None = None) -> None:
         self.frames = 0
         self.scores = np.zeros(0, np.float32)
         self._traverse = traverse
+        self._judge = Judge(self.config, self.method, one_stream=traverse.one_stream, reference=reference)
 
     def _mean_of(self, features: list[np.ndarray]) -> np.ndarray | None:
         recent: deque[np.ndarray] = deque(maxlen=self.method.window)
@@ -275,32 +326,30 @@ class LoopDetector:
             unreadable = len(warm_up.kept) - len(warm_up.readable)
             without = f", {unreadable} of them unreadable" if unreadable else ""
             self.learned_on.append(f"frames 0 to {len(warm_up.kept) - 1} of the drive{without}")
-            before = self._traverse
             self._traverse = self._new_traverse(prior=self._mean_of(warm_up.readable))
-            self._traverse.consistency = before.consistency  # what was decided stays decided
             for item in warm_up.kept[:-1]:
                 self._traverse.step(item)
         if warm_up.finished:
             self._warm_up = None
 
-    def _fit_on(self, images: Frames, *, source: str, progress: Progress | None) -> dict[int, np.ndarray]:
-        """Fit the method on evenly spaced frames and return the features of these, by index."""
+    def _fit_on(self, images: Frames, *, source: str, progress: Progress | None) -> dict[int, View]:
+        """Fit the method on evenly spaced frames and return what was seen in these, by index."""
+        images = self._as_needed(images)
         learning = self.config.learning
-        first = self._features(next((image for image in images if image is not None), None))
-        if first is None:
+        first = self._look(next((image for image in images if image is not None), None))
+        if first.features is None:
             raise FitError(f"none of the {len(images)} frames of the {source} can be read: nothing to fit on")
-        most = max(2, min(learning.fit_frames, int(learning.max_kept_mb * 1e6 / first.nbytes)))
+        most = max(2, min(learning.fit_frames, int(learning.max_kept_mb * 1e6 / first.features.nbytes)))
         chosen = _evenly_spaced(len(images), most)
         seen = {}
-        for index, image in read_ahead(_at(images, chosen)):
-            features = self._features(image)
-            if features is not None:
-                seen[index] = features
+        for index, view in self._look_ahead(_at(images, chosen)):
+            if view.features is not None:
+                seen[index] = view
             if progress:
                 progress(index + 1, len(images))
         seen = seen or {0: first}
         with self._clock("learn"):
-            self.method.fit(list(seen.values()))
+            self.method.fit([view.features for view in seen.values() if view.features is not None])
         self.learned_on = [f"{len(seen)} of {len(images)} frames of the {source}"]
         return seen
 
@@ -308,16 +357,17 @@ class LoopDetector:
         """Write what was learned, without the map; ``LoopDetector(model=folder)`` starts with it."""
         if not self.method.fitted:
             raise FitError("nothing was fitted yet: no model to save")
-        return store.save_arrays(folder, kind="model", header=self._header(), arrays=self._learned_arrays())
+        return store.save_arrays(folder, kind="model", header=self._header(folder), arrays=self._learned_arrays())
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write the whole detector; `load` brings it back as if it had never stopped."""
         parts = {
             "method": self._learned_arrays() if self.method.fitted else {},
             "traverse": self._traverse.to_arrays(),
+            "judge": self._judge.to_arrays(),
             "warm_up": self._warm_up.to_arrays() if self._warm_up else {},
         }
-        header = self._header() | {
+        header = self._header(folder) | {
             "frames": self.frames,
             "one_stream": self.one_stream,
             "fitted": self.method.fitted,
@@ -337,20 +387,24 @@ class LoopDetector:
         """
         header, arrays = store.load_arrays(folder, kind="detector")
         with store.damaged_is_an_error(folder):
-            return cls._rebuilt(header, arrays, progress)
+            return cls._rebuilt(store.saved_config(header, folder), header, arrays, progress)
 
     @classmethod
     def _rebuilt(
-        cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], progress: Progress | None
+        cls, config: Config, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], progress: Progress | None
     ) -> LoopDetector:
-        detector = cls(Config.from_dict(header["config"]), progress=progress)
-        if header["fitted"]:
-            detector._restore_method(header, store.part(arrays, "method"))
+        detector = cls(config, progress=progress)
+        detector._restore_method(header, store.part(arrays, "method"))
         state = store.part(arrays, "traverse")
         reference = None
         if not header["one_stream"]:
             reference = detector.method.new_map(exclude_recent=0)
-        detector._start(detector._new_traverse(reference=reference).restore(state))
+        judge = store.part(arrays, "judge")
+        views = None if header["one_stream"] else new_views(config, detector.method)
+        if views is not None:
+            views.restore(store.part(judge, "places"))
+        detector._start(detector._new_traverse(reference=reference).restore(state), views)
+        detector._judge.restore(judge)
         detector.frames = int(header["frames"])
         detector._warm_up = None
         if header["warming_up"]:
@@ -360,9 +414,10 @@ class LoopDetector:
     def _learned_arrays(self) -> dict[str, np.ndarray]:
         return self.method.to_arrays() | ({} if self._mean is None else {_MEAN: self._mean})
 
-    def _header(self) -> dict[str, Any]:
+    def _header(self, folder: str | os.PathLike[str] | None = None) -> dict[str, Any]:
+        config = self.config if folder is None else store.carry_weights(self.config, folder)
         return {
-            "config": self.config.model_dump(),
+            "config": config.model_dump(),
             "learned_on": self.learned_on,
             "provenance": self.method.provenance,
         }
@@ -372,6 +427,8 @@ class LoopDetector:
             raise ModelError(
                 f"fitted with {header['provenance']}, here are {self.method.provenance}; fetch those weights"
             )
+        if not header.get("fitted", True):  # a trained network alone
+            return
         self.method.restore({name: array for name, array in arrays.items() if name != _MEAN})
         self._mean = arrays.get(_MEAN)
         self.learned_on = list(header["learned_on"])
@@ -387,7 +444,16 @@ def _agreed_config(
     if config is None:
         return fitted
     wanted, found = config.flat(), fitted.flat()
-    free = ("images.", "learning.", "sequence.", "decision.", "aggregation.centre_window")
+    free = (
+        "images.",
+        "learning.",
+        "training.",
+        "sequence.",
+        "decision.",
+        "verification.",
+        "aggregation.centre",
+        "features.backend",
+    )
     binding = [name for name in wanted if not name.startswith(free)]
     if fitted.compression.reading == "sequence":
         binding.append("sequence.length")
@@ -398,10 +464,6 @@ def _agreed_config(
                 "leave that setting out or fit again with it"
             )
     return config
-
-
-def _no_candidate(query: int, reason: Reason) -> Decision:
-    return Decision(query, None, None, accepted=False, inliers=None, reason=reason)
 
 
 def _evenly_spaced(count: int, most: int) -> list[int]:

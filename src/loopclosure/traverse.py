@@ -10,7 +10,6 @@ import numpy as np
 
 from loopclosure.aggregation.centring import RunningMean, centre_traverse
 from loopclosure.config import Config
-from loopclosure.matching.consistency import Consistency
 from loopclosure.methods import Method, PlaceMap
 from loopclosure.store import part
 from loopclosure.timing import Stopwatch
@@ -48,7 +47,6 @@ class Traverse:
         self.one_stream = reference is None
         exclude = config.sequence.exclude_recent if self.one_stream else 0
         self.places = method.new_map(exclude_recent=exclude) if reference is None else reference
-        self.consistency = Consistency(both_directions=config.sequence.direction == "both")
         self._method = method
         self._clock = clock
         self._mean = RunningMean(_window(method, config, reference), prior=prior)
@@ -66,7 +64,7 @@ class Traverse:
         with self._clock("describe"):
             descriptor = describe(self._method, features, self._recent)
             if self._method.centred:
-                descriptor = self._mean.centre(descriptor)
+                descriptor = self._method.reduce(self._mean.centre(descriptor))
         with self._clock("match"):
             similarities = self.places.similarities(descriptor)
             scores = self._sequences.push(similarities)
@@ -85,7 +83,6 @@ class Traverse:
             "map": self.places.to_arrays(),
             "mean": self._mean.to_arrays(),
             "sequences": self._sequences.to_arrays(),
-            "consistency": self.consistency.to_arrays(),
             "recent": {f"{i:06}": features for i, features in enumerate(self._recent)},
         }
         return {f"{name}.{key}": array for name, arrays in parts.items() for key, array in arrays.items()}
@@ -95,7 +92,6 @@ class Traverse:
         self.places.restore(part(arrays, "map"))
         self._mean = RunningMean.from_arrays(part(arrays, "mean"))
         self._sequences.restore(part(arrays, "sequences"))
-        self.consistency.restore(part(arrays, "consistency"))
         self._recent.extend(features for _, features in sorted(part(arrays, "recent").items()))
         return self
 
@@ -109,10 +105,11 @@ def describe(method: Method, features: Features, recent: deque[np.ndarray]) -> A
 
 
 def describe_traverse(method: Method, config: Config, frames: Sequence[Any]) -> tuple[Any, np.ndarray | None]:
-    """Take the mean out of the descriptors of a traverse that is known as a whole; return them and the mean."""
+    """Take the mean out of the descriptors of a whole traverse; return what the map keeps of them, and the mean."""
     if not method.centred:
         return frames, None
-    return centre_traverse(np.stack(frames), window=config.aggregation.centre_window)
+    centred, mean = centre_traverse(np.stack(frames), window=config.aggregation.centre_window)
+    return [method.reduce(descriptor) for descriptor in centred], mean
 
 
 def _window(method: Method, config: Config, reference: PlaceMap | None) -> int:

@@ -97,12 +97,14 @@ class RunningMean:
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the state, for `loopclosure.store`."""
         arrays = {"window": np.array(self.window)} | ({} if self.prior is None else {"prior": self.prior})
-        return arrays | ({"recent": np.stack(self._recent)} if self._recent else {})
+        if self._sum is None:
+            return arrays
+        return arrays | {"recent": np.stack(self._recent), "sum": self._sum.copy()}  # as it was rounded
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> RunningMean:
         """Rebuild the state that `to_arrays` gave."""
         mean = cls(int(arrays["window"]), prior=arrays.get("prior"))
-        for descriptor in arrays.get("recent", ()):
-            mean.centre(descriptor)
+        mean._recent.extend(arrays.get("recent", ()))
+        mean._sum = arrays["sum"].copy() if "sum" in arrays else None
         return mean

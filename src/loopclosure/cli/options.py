@@ -23,10 +23,13 @@ _FLAGS = {
     "backbone": "features.backbone",
     "layer": "features.layer",
     "weights": "features.weights",
+    "backend": "features.backend",
     "gamma": "compression.gamma",
     "sequence_length": "sequence.length",
     "exclude_recent": "sequence.exclude_recent",
     "threshold": "decision.threshold",
+    "false_loops_per_1000": "decision.false_loops_per_1000",
+    "verification": "verification.mode",
     "on_error": "images.on_error",
 }
 """Flag -> the setting that it sets."""
@@ -45,7 +48,7 @@ def configurable(command: Callable[..., None]) -> Callable[..., None]:
         flags = {setting: given.pop(flag) for flag, setting in _FLAGS.items()}
         preset, file, pairs = given.pop("preset"), given.pop("config"), given.pop("set_")
         settings = read_toml(file) if file else {}
-        settings |= dict(map(_parse_pair, pairs or ()))
+        settings |= dict(map(parse_pair, pairs or ()))
         settings |= {setting: value for setting, value in flags.items() if value is not None}
         command(_base(preset, given.get("model"), given.get("reference")).with_settings(settings), **given)
 
@@ -98,10 +101,13 @@ def _base(preset: str | None, model: Path | None, reference: Path | None) -> Con
     return saved_config(load_header(folder, kind=kind), folder)
 
 
-def _parse_pair(text: str) -> tuple[str, str]:
+def parse_pair(
+    text: str, *, flag: str = "--set", wants: str = "stage.field=value, such as --set sequence.length=5"
+) -> tuple[str, str]:
+    """Take NAME=VALUE apart; `flag` and `wants` are for the error."""
     name, equals, value = text.partition("=")
     if not equals:
-        raise ConfigError(f"--set {text}: wants stage.field=value, such as --set sequence.length=5")
+        raise ConfigError(f"{flag} {text}: wants {wants}")
     return name.strip(), value.strip()
 
 

@@ -64,12 +64,22 @@ class Method(ABC):
         Frames whose features one descriptor is made of.
     threshold : float
         Least score of a loop where the configuration sets none.
+    calibrated : bool
+        Whether similarities mean the same on every drive, so that `loopclosure.decision` knows the odds of a loop. A
+        score is then a probability, and no threshold of the method is needed.
+    sums : type
+        Of `SequenceScores`, the one that sums similarities over sequences.
+    input_size : tuple of 2 int, or None
+        Height and width, pixels, to which `features` shrinks every image first; None where it needs all pixels.
     """
 
     fitted = True
     centred = False
     window = 1
     threshold = 0.5
+    calibrated = False
+    sums: type[SequenceScores] = SequenceScores
+    input_size: tuple[int, int] | None = None
 
     def __init__(self, config: Config) -> None:
         self.config = config
@@ -87,6 +97,10 @@ class Method(ABC):
     def describe(self, features: Sequence[np.ndarray]) -> Any:
         """Describe the newest of the last `window` frames from their features, oldest first."""
 
+    def reduce(self, centred: Any) -> Any:
+        """Return what the map keeps of a descriptor from which the mean was taken out."""
+        return centred
+
     @abstractmethod
     def blank(self) -> Any:
         """Return the descriptor of a frame that says nothing."""
@@ -98,7 +112,7 @@ class Method(ABC):
     def new_scores(self, *, exclude_recent: int) -> Scores:
         """Return what sums similarities over sequences: Eq. 20 unless the method brings its own."""
         sequence = self.config.sequence
-        return SequenceScores(
+        return self.sums(
             1 if self.window > 1 else sequence.length,
             exclude_recent=exclude_recent,
             both_directions=sequence.direction == "both",

@@ -7,7 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from loopclosure.aggregation.centring import centre_traverse
 from loopclosure.aggregation.netvlad import NetVLAD, unit
+from loopclosure.aggregation.reduction import Reduction
+from loopclosure.aggregation.selection import GAMMAS, margin
 from loopclosure.compression import READINGS, ChannelKL, FlatKL, SequenceKL
 from loopclosure.config import Config
 from loopclosure.errors import FitError
@@ -20,6 +23,9 @@ from loopclosure.store import part
 class KLNetVLAD(Method):
     """Describe images by compressed ConvNet features.
 
+    Where the mean of the traverse is taken out, ``aggregation.components`` whitened numbers are kept of a NetVLAD
+    descriptor. Similarities then mean the same on every drive, and `loopclosure.decision` knows the odds of a loop.
+
     The reading of the KL transform (``compression.reading``) decides what a frame's descriptor is:
 
     ========  ============================================  =====================================
@@ -30,6 +36,12 @@ class KLNetVLAD(Method):
     flat      the frame, layout kept                        the compressed map itself, (k,)
     sequence  the last l frames, as k eigen-images          NetVLAD of each of them, (k, K * c)
     ========  ============================================  =====================================
+
+    Attributes
+    ----------
+    gamma : float or None
+        The compression ratio in force; with ``compression.gamma = "auto"`` the one under which neighbouring frames
+        stand out most from far ones (`loopclosure.aggregation.selection`).
 
     Parameters
     ----------
@@ -46,12 +58,19 @@ class KLNetVLAD(Method):
     def __init__(self, config: Config, *, progress: Callable[[int, int], None] | None = None) -> None:
         super().__init__(config)
         self.backbone = open_network(config, progress=progress)
+        self.input_size = self.backbone.preprocessing.size
         self._reading = config.compression.reading
         self._rule = config.compression.model_dump(exclude={"reading"})
+        self.gamma: float | None = GAMMAS[0] if self._rule["gamma"] == "auto" else self._rule["gamma"]
         self._kl: ChannelKL | FlatKL | SequenceKL | None = None
         if self._reading != "none":
-            self._kl = READINGS[self._reading](**self._rule)
+            self._kl = READINGS[self._reading](**self._rule | {"gamma": self.gamma})
         self._netvlad = NetVLAD(config.aggregation.clusters, seed=config.learning.seed)
+        self._reduction: Reduction | None = None
+        self._components = config.aggregation.components if self._reading in ("channel", "none") else 0
+        if not config.aggregation.centre_window:
+            self._components = 0
+        self.calibrated = bool(self._components)
         self._blank: np.ndarray | None = None
         if self._reading == "sequence":
             self.window = config.sequence.length
@@ -71,14 +90,33 @@ class KLNetVLAD(Method):
         if self._reading == "sequence":
             starts = range(0, len(stacked), self.window)
             self._netvlad.fit(
-                np.concatenate([self._compress(self._padded(stacked[i : i + self.window])) for i in starts])
+                np.concatenate([self.compress(self._padded(stacked[i : i + self.window])) for i in starts])
             )
+        elif self.config.compression.gamma == "auto":
+            self.gamma = max(GAMMAS, key=lambda gamma: self._margin(stacked, gamma))
+            self._learn(stacked)
         else:
-            if self._kl is not None:
-                self._kl.fit(stacked)
-            if self._reading != "flat":
-                self._netvlad.fit(self._compress(stacked))
+            self._learn(stacked)
         self.fitted, self._blank = True, None
+
+    def _learn(self, maps: np.ndarray) -> None:
+        """Learn basis, clusters and reduction from maps (n, h, w, c)."""
+        if self._kl is not None:
+            self._kl = READINGS[self._reading](**self._rule | {"gamma": self.gamma})
+            self._kl.fit(maps)
+        code = self.compress(maps)
+        if self._reading != "flat":
+            self._netvlad.fit(code)
+        if self._components:
+            descriptors, _ = centre_traverse(self.aggregate(code), window=len(maps))
+            self._reduction = Reduction(self._components).fit(descriptors)
+
+    def _margin(self, maps: np.ndarray, gamma: float) -> float:
+        """Return how well places are told apart with this compression ratio."""
+        self.gamma = gamma
+        self._learn(maps)
+        descriptors, _ = centre_traverse(self.aggregate(self.compress(maps)), window=len(maps))
+        return margin(np.stack([self.reduce(descriptor) for descriptor in descriptors]))
 
     def describe(self, features: Sequence[np.ndarray]) -> np.ndarray:
         """Describe the newest of the last `window` frames.
@@ -96,15 +134,22 @@ class KLNetVLAD(Method):
             raise FitError("the method has learned no basis and no clusters yet; call fit first")
         stacked = np.stack(features)
         if self._reading == "sequence":
-            return self._netvlad.transform(self._compress(self._padded(stacked)))
-        code = self._compress(stacked)
-        return unit(code)[0] if self._reading == "flat" else self._netvlad.transform(code)[0]
+            return self.aggregate(self.compress(self._padded(stacked)))
+        return self.aggregate(self.compress(stacked))[0]
 
-    def _compress(self, maps: np.ndarray) -> np.ndarray:
-        """Return what the reading makes of maps (n, h, w, c)."""
+    def reduce(self, centred: np.ndarray) -> np.ndarray:
+        """Return the whitened descriptor, float32 (aggregation.components,), or the same where that is 0."""
+        return centred if self._reduction is None else self._reduction.transform(centred)
+
+    def compress(self, maps: np.ndarray) -> np.ndarray:
+        """Return what the reading makes of maps, float32 (n, h, w, c)."""
         if isinstance(self._kl, SequenceKL):
             self._kl.fit(maps)  # nothing is learned across sequences
         return maps if self._kl is None else self._kl.transform(maps)
+
+    def aggregate(self, code: np.ndarray) -> np.ndarray:
+        """Return one descriptor for each code that `compress` gave, float32 (n, d)."""
+        return unit(code) if self._reading == "flat" else self._netvlad.transform(code)
 
     def _padded(self, maps: np.ndarray) -> np.ndarray:
         """Fill a window that is not full yet with its first frame."""
@@ -126,12 +171,18 @@ class KLNetVLAD(Method):
         arrays = {f"kl.{name}": array for name, array in self._kl.to_arrays().items()} if self._kl is not None else {}
         if self._reading != "flat":
             arrays |= {f"netvlad.{name}": array for name, array in self._netvlad.to_arrays().items()}
-        return arrays
+        if self._reduction is not None:
+            arrays |= {f"reduction.{name}": array for name, array in self._reduction.to_arrays().items()}
+        return arrays if self.gamma is None else arrays | {"gamma": np.array(self.gamma)}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take over what `to_arrays` gave."""
+        if "gamma" in arrays:
+            self.gamma = float(arrays["gamma"])
         if self._kl is not None:
-            self._kl = type(self._kl).from_arrays(part(arrays, "kl"), **self._rule)
+            self._kl = type(self._kl).from_arrays(part(arrays, "kl"), **self._rule | {"gamma": self.gamma})
         if self._reading != "flat":
             self._netvlad = NetVLAD.from_arrays(part(arrays, "netvlad"), seed=self.config.learning.seed)
+        if self._components:
+            self._reduction = Reduction.from_arrays(part(arrays, "reduction"))
         self.fitted = True

@@ -25,6 +25,7 @@ _RATIO = 0.87
 _UNITS = 640  # of length, along the longer side of an image: cameras differ in resolution
 _THRESHOLD = 1.5  # units to the model
 _STILL = 1.5  # units that a match moves at most when it belongs to the camera
+_HARDLY_MOVED = 25.0  # units that a point moves at most in a few frames when it goes along with the robot
 _STANDS = 0.6  # share of still matches above which it is the camera that stands
 
 
@@ -121,6 +122,9 @@ class Verifier:
     True
     """
 
+    side = _SIDE
+    """Pixels to which the longer side of an image is scaled: more are not needed."""
+
     def __init__(
         self,
         mode: VerificationMode = "fast",
@@ -198,6 +202,24 @@ class Verifier:
         if found.support < self.least_support:
             return found
         return replace(found, verified=True, motion=self._motion(found, max(query.size)))
+
+    def without_still(self, features: LocalFeatures, earlier: LocalFeatures) -> LocalFeatures:
+        """Leave out what stays where it was in an earlier view of the same drive, unless the camera stands.
+
+        Parameters
+        ----------
+        features, earlier : LocalFeatures
+            Of this verifier, a few frames apart.
+        """
+        pairs, distinct = mutual_matches(features, earlier, ratio=_RATIO)
+        found = pairs[distinct]
+        moved = features.points[found[:, 0]] - earlier.points[found[:, 1]]
+        still = np.linalg.norm(moved, axis=1) * (_UNITS / max(features.size)) < _HARDLY_MOVED
+        if features.size != earlier.size or still.sum() > _STANDS * len(features):
+            return features
+        moving = np.full(len(features), True)
+        moving[found[still, 0]] = False
+        return LocalFeatures(features.points[moving], features.descriptors[moving], features.size)
 
     def agree(self, verifications: Sequence[Verification]) -> bool:
         """Say whether frames that follow each other show one place, from what was found in each with its own match.

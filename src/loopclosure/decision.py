@@ -1,0 +1,216 @@
+"""From scores to a decision: what speaks for each candidate, the odds of a loop, and why it was accepted or not.
+
+Where a method's similarities mean the same on every drive (`Method.calibrated`) the score of a decision is the
+probability of a loop, and `decision.false_loops_per_1000` is the only knob. Elsewhere it is the similarity of the two
+sequences, which must reach a threshold on frames that move on together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from loopclosure.config import Config
+from loopclosure.matching.candidates import Candidate, best_candidates
+from loopclosure.matching.consistency import Consistency
+from loopclosure.methods import Method
+from loopclosure.records import Decision, Reason
+from loopclosure.store import part
+from loopclosure.verification import LocalFeatures, Verifier, Views, Witness
+
+_CANDIDATES = 4  # that are looked at; the true place is among so many far more often than it is the first
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What speaks for one candidate.
+
+    Attributes
+    ----------
+    match : int
+        The candidate's frame in the map.
+    similarity : float
+        Of the two sequences, 1 - D (Eq. 20).
+    standing : float
+        Standard deviations by which it lies above the best that chance would give, see `Candidate`.
+    run : int
+        Frames over which the candidate has moved on with the robot.
+    support : float
+        Geometric support in the frames of the sequence, see `Verification.support`; 0 without verification.
+    inliers : int or None
+        Matches that agree with one camera motion, in the best of these frames; None where none was looked at.
+    """
+
+    match: int
+    similarity: float
+    standing: float
+    run: int
+    support: float = 0.0
+    inliers: int | None = None
+
+    @property
+    def log_odds(self) -> float:
+        """Natural logarithm of the odds that the candidate is a loop."""
+        return _CONSTANT + sum(weight * value for weight, value in zip(_WEIGHTS, features_of(self), strict=True))
+
+    @property
+    def probability(self) -> float:
+        """That the candidate is a loop, 0..1."""
+        return 1 / (1 + math.exp(-self.log_odds))
+
+
+_LONGEST_RUN = 40
+_SUPPORT_BY_CHANCE = 1.0
+# Fitted by `python benchmarks/calibration.py`, which prints them and what they come to on places that were left out.
+_WEIGHTS = 0.35, 9.0, 0.2, 3.6
+_CONSTANT = -6.2
+_FALSE_PER_1000 = 50.0  # false loops among 1000 frames that no loop is in, at even odds
+
+
+def features_of(evidence: Evidence) -> tuple[float, ...]:
+    """Return the numbers that the log-odds are a weighted sum of: standing, similarity, run, support."""
+    return (
+        min(max(evidence.standing, -1.0), 6.0),
+        evidence.similarity - 0.5,
+        float(min(evidence.run, _LONGEST_RUN)),
+        math.log1p(max(evidence.support - _SUPPORT_BY_CHANCE, 0.0)),
+    )
+
+
+def least_probability(false_loops_per_1000: float) -> float:
+    """Return the probability from which on a loop is accepted, so that no more false ones than that are to be expected.
+
+    Examples
+    --------
+    >>> round(least_probability(1.0), 3)
+    0.98
+    """
+    return 1 - min(false_loops_per_1000 / _FALSE_PER_1000, 0.5)
+
+
+class Judge:
+    """Decide frame by frame; what was seen before counts.
+
+    Parameters
+    ----------
+    config : Config
+        Its sections `sequence`, `decision` and `verification` are used.
+    method : Method
+        Whose scores are judged.
+    one_stream : bool
+        Whether candidates come from the drive itself.
+    reference : Views, optional
+        Local features of the reference traverse; without it the drive's own are used.
+
+    Attributes
+    ----------
+    evidence : tuple of Evidence
+        What spoke for each candidate of the last frame, best first.
+    views : Views or None
+        Local features of the drive; None where nothing is verified.
+    places : Views or None
+        Those of the map: of the reference traverse, or the same ones.
+    """
+
+    def __init__(self, config: Config, method: Method, *, one_stream: bool, reference: Views | None = None) -> None:
+        self.config = config
+        self.method = method
+        self.one_stream = one_stream
+        self.evidence: tuple[Evidence, ...] = ()
+        self.views = new_views(config, method)
+        self.places = self.views if reference is None else reference
+        self._consistency = Consistency(both_directions=config.sequence.direction == "both")
+        self._witness: Witness | None = None
+        if self.views is not None and self.places is not None:
+            self._witness = Witness(
+                self.views,
+                self.places,
+                length=config.sequence.length,
+                both_directions=config.sequence.direction == "both",
+            )
+
+    @property
+    def threshold(self) -> float:
+        """Least score of a loop."""
+        if self.config.decision.threshold is not None:
+            return self.config.decision.threshold
+        if self.method.calibrated:
+            return least_probability(self.config.decision.false_loops_per_1000)
+        return self.method.threshold
+
+    def see(self, query: int, local: LocalFeatures | None) -> None:
+        """Take the local features of a frame, where they are kept (`Views.wanted`)."""
+        if self.views is not None and self.views.wanted(query):
+            self.views.add(local)
+
+    def decide(self, query: int, scores: np.ndarray, *, readable: bool) -> Decision:
+        """Decide on a frame by its sequence scores, float32 (n,), NaN where a place is no candidate."""
+        candidates = []
+        if readable:
+            count = _CANDIDATES if self.method.calibrated else 1
+            candidates = best_candidates(scores, count=count, length=self.config.sequence.length)
+        runs = self._consistency.push([candidate.match for candidate in candidates])
+        self.evidence = self._weighed(query, candidates, runs)
+        if not self.evidence:
+            return Decision(query, None, None, False, None, self._why_none(query) if readable else Reason.UNREADABLE)
+        best = self.evidence[0]
+        reason = self._why(best)
+        score = best.probability if self.method.calibrated else best.similarity
+        return Decision(query, best.match, score, reason is Reason.ACCEPTED, best.inliers, reason)
+
+    def _weighed(self, query: int, candidates: list[Candidate], runs: list[int]) -> tuple[Evidence, ...]:
+        found = [
+            Evidence(candidate.match, candidate.score, candidate.standing, run)
+            for candidate, run in zip(candidates, runs, strict=True)
+        ]
+        if self._witness is not None:
+            heard = self._witness.hear(query, [candidate.match for candidate in candidates])
+            found = [replace(one, **two._asdict()) for one, two in zip(found, heard, strict=True)]
+        return tuple(sorted(found, key=lambda one: -one.log_odds)) if self.method.calibrated else tuple(found)
+
+    def _why(self, best: Evidence) -> Reason:
+        """Say what the candidate lacks: the first thing that alone would have made it a loop."""
+        if not self.method.calibrated:
+            if best.similarity < self.threshold:
+                return Reason.BELOW_THRESHOLD
+            return Reason.ACCEPTED if best.run >= self.config.decision.consistency else Reason.INCONSISTENT
+        if best.probability >= self.threshold:
+            return Reason.ACCEPTED
+        if replace(best, run=_LONGEST_RUN).probability >= self.threshold:
+            return Reason.INCONSISTENT
+        if self._witness is None:
+            return Reason.BELOW_THRESHOLD
+        confirmed = replace(best, support=best.support + self._witness.bar)
+        return Reason.NOT_VERIFIED if confirmed.probability >= self.threshold else Reason.BELOW_THRESHOLD
+
+    def _why_none(self, query: int) -> Reason:
+        old_enough = not self.one_stream or query >= self.config.sequence.exclude_recent
+        return Reason.SEQUENCE_TOO_SHORT if old_enough else Reason.TOO_RECENT
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return the state, for `loopclosure.store`."""
+        parts = {"consistency": self._consistency.to_arrays()}
+        if self.views is not None and self._witness is not None:
+            parts |= {"views": self.views.to_arrays(), "witness": self._witness.to_arrays()}
+            if self.places is not None and self.places is not self.views:
+                parts["places"] = self.places.to_arrays()
+        return {f"{name}.{key}": array for name, arrays in parts.items() for key, array in arrays.items()}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> Judge:
+        """Take over the state that `to_arrays` gave."""
+        self._consistency.restore(part(arrays, "consistency"))
+        if self.views is not None and self._witness is not None:
+            self.views.restore(part(arrays, "views"))
+            self._witness.restore(part(arrays, "witness"))
+        return self
+
+
+def new_views(config: Config, method: Method) -> Views | None:
+    """Return an empty store of local features; None where nothing is to be verified."""
+    mode = config.verification.mode
+    if mode == "none" or not method.calibrated:
+        return None
+    return Views(Verifier(mode), every=min(config.verification.every, max(config.sequence.length // 2, 1)))

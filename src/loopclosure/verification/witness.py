@@ -1,0 +1,82 @@
+"""Verification along a sequence: several pairs of frames that agree count more than one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from loopclosure.verification.views import Views
+
+_SLACK, _SLACK_A_FRAME = 2.0, 0.5  # frames by which two drives may differ in pace and still be on one track
+
+
+class Heard(NamedTuple):
+    """What the frames of a sequence say of a candidate.
+
+    Attributes
+    ----------
+    support : float
+        Mean of the two best supports (`Verification.support`) on the way to the candidate; 0 where there is none.
+    inliers : int or None
+        Of the best one; None where no pair was looked at.
+    """
+
+    support: float
+    inliers: int | None
+
+
+class Witness:
+    """Verify the candidates of those frames that have a view, and remember for the others.
+
+    Parameters
+    ----------
+    drive, places : Views
+        Of the frames that come in, and of the map; the same object in one stream.
+    length : int
+        Frames for which a verification counts.
+    both_directions : bool
+        Whether a place may also be driven through the other way.
+    """
+
+    def __init__(self, drive: Views, places: Views, *, length: int, both_directions: bool = False) -> None:
+        self._drive, self._places, self._length, self._both = drive, places, length, both_directions
+        self._seen = np.zeros((0, 4))  # query, match, support, inliers
+
+    @property
+    def bar(self) -> float:
+        """Support of a pair that is verified by itself."""
+        return self._drive.verifier.least_support
+
+    def hear(self, query: int, matches: Sequence[int]) -> list[Heard]:
+        """Return what is known of each candidate of a frame, after a look at the frame if it has a view."""
+        self._seen = self._seen[self._seen[:, 0] > query - self._length]
+        if self._drive.wanted(query) and len(self._places):
+            self._look(query, matches)
+        age = query - self._seen[:, 0]
+        return [self._on_the_way(match - self._seen[:, 1], age) for match in matches]
+
+    def _look(self, query: int, matches: Sequence[int]) -> None:
+        seen = self._drive.nearest(query)[1]
+        for frame, place in dict(map(self._places.nearest, matches)).items():
+            if seen is not None and place is not None:
+                found = self._drive.verifier.verify(seen, place)
+                self._seen = np.vstack([self._seen, (query, frame, found.support, found.inliers)])
+
+    def _on_the_way(self, moved: np.ndarray, age: np.ndarray) -> Heard:
+        off = np.abs(np.abs(moved) - age if self._both else moved - age)
+        near = self._seen[off <= _SLACK + _SLACK_A_FRAME * age]
+        if not len(near):
+            return Heard(0.0, None)
+        best = near[np.argsort(-near[:, 2], kind="stable")[:2]]
+        return Heard(float(best[:, 2].mean()), int(best[0, 3]))
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return the state, for `loopclosure.store`."""
+        return {"seen": self._seen}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> Witness:
+        """Take over the state that `to_arrays` gave."""
+        self._seen = arrays["seen"]
+        return self

@@ -39,4 +39,18 @@ def main() -> None:
         logging.getLogger("loopclosure").removeHandler(warnings)
 
 
-from loopclosure.cli import compare, datasets, detect, evaluate, explain, fit, reproduce, simulate, tables  # noqa: E402, F401  (they register their commands)
+# They register their commands.
+from loopclosure.cli import (
+    bench,
+    compare,
+    datasets,
+    detect,
+    evaluate,
+    explain,
+    export,
+    fit,
+    reproduce,
+    simulate,
+    tables,
+    train,
+)

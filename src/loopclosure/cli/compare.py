@@ -9,7 +9,7 @@ import typer
 
 from loopclosure.cli import app
 from loopclosure.cli.console import print_json, progress_bars, say
-from loopclosure.cli.options import Json, Quiet, configurable
+from loopclosure.cli.options import Json, Quiet, configurable, parse_pair
 from loopclosure.config import Config
 from loopclosure.errors import ConfigError
 from loopclosure.evaluation.tables import NanPoses
@@ -26,6 +26,10 @@ def compare(
     out: Annotated[Path, typer.Option(help="Folder to write; each method's run folder is in it.")] = Path("compare"),
     methods: Annotated[str, typer.Option(help="Names with commas between them, or all.")] = "all",
     reference: Annotated[Path | None, typer.Option(help="Another traverse, that alone holds the candidates.")] = None,
+    models: Annotated[
+        list[str] | None,
+        typer.Option("--model", metavar="METHOD=MODEL", help="Model that `fit` wrote for a method; may be repeated."),
+    ] = None,
     tolerance: Annotated[int, typer.Option(min=0, help="A match so many frames from a true one is right.")] = 0,
     view: Annotated[View, typer.Option(help="Truth of one camera of an interleaved stereo set.")] = "all",
     key: Annotated[str | None, typer.Option(help="Name of the matrix in a .mat file.")] = None,
@@ -37,7 +41,8 @@ def compare(
     """Run several methods on the same images: accuracy and ms an image in one table (compare.csv, compare.html).
 
     --backbone and --weights are for every method that runs on feature maps. Without them each has its own network;
-    where its weights are not to be had, the embedded one stands in, and the table says so.
+    where its weights are not to be had, the embedded one stands in, and the table says so. --weights METHOD=WEIGHTS,
+    with commas between several, is for these methods alone.
 
     Examples:
 
@@ -45,13 +50,19 @@ def compare(
 
       loopclosure compare evening/ --reference morning/ --truth pairs.csv --methods all --tolerance 2
 
-      loopclosure compare drive/ --truth drive.csv --methods netvlad-resnet152 --weights random
+      loopclosure compare drive/ --truth drive.csv --methods bow,fabmap --model bow=words --model fabmap=places
+
+      loopclosure compare drive/ --truth drive.csv --methods cnn,faster-rcnn --weights faster-rcnn=random
     """
     from loopclosure.evaluation.compare import compare_methods
     from loopclosure.report.comparison import HEADS, protocol_line, record, shown_rows, write_comparison
 
     if context.params["method"] is not None:
         raise ConfigError("--method is for a command that runs one; here it is --methods a,b,c")
+    weights = _by_method(context.params["weights"] or "")
+    if weights:
+        config = config.with_settings({"features.weights": "default"})
+    wants = "METHOD=MODEL, such as --model bow=words"
     with progress_bars(quiet=quiet or json) as progress:
         comparison = compare_methods(
             source,
@@ -61,6 +72,8 @@ def compare(
             reference=reference,
             config=config,
             backbone=context.params["backbone"],
+            weights=weights,
+            models=dict(parse_pair(pair, flag="--model", wants=wants) for pair in models or ()),
             tolerance=tolerance,
             truth_settings={"view": view, "key": key, "radius_m": radius, "nan_poses": nan_poses},
             progress=progress,
@@ -81,7 +94,15 @@ def compare(
         for name, note in ((row.method, row.note) for row in rows if row.note):
             say(f"{name}: {note}", quiet=quiet)
         say(f"protocol: {protocol_line(comparison.protocol)}", quiet=quiet)
-        say(f"machine: {comparison.machine}; ms an image, one at a time", quiet=quiet)
+        say(f"machine: {comparison.machine}", quiet=quiet)
         say(f"look at {page}", quiet=quiet)
     if not any(result.metrics for result in comparison.results):
         raise typer.Exit(1)
+
+
+def _by_method(weights: str) -> dict[str, str]:
+    """Take METHOD=WEIGHTS,METHOD=WEIGHTS apart; empty where they are for all methods."""
+    if "=" not in weights or Path(weights).is_file():
+        return {}
+    wants = "METHOD=WEIGHTS, such as --weights faster-rcnn=random"
+    return dict(parse_pair(part, flag="--weights", wants=wants) for part in weights.split(","))

@@ -6,7 +6,8 @@ import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import typer
 from pydantic.fields import FieldInfo
@@ -87,9 +88,10 @@ def _field_parameter(name: str, field: FieldInfo) -> inspect.Parameter:
 
 def _type_of(field: FieldInfo) -> Any:
     """Return what the command line checks: a choice, a number, a switch, or else text."""
-    options = (field.annotation, *get_args(field.annotation))
-    known = [kind for kind in options if get_origin(kind) is Literal or kind in (bool, int, float)]
-    return known[0] if known else str
+    union = get_origin(field.annotation) in (Union, UnionType)
+    kinds = [kind for kind in get_args(field.annotation) if kind is not NoneType] if union else [field.annotation]
+    known = len(kinds) == 1 and (get_origin(kinds[0]) is Literal or kinds[0] in (bool, int, float))
+    return kinds[0] if known else str
 
 
 def _base(preset: str | None, model: Path | None, reference: Path | None) -> Config:

@@ -10,9 +10,8 @@ import typer
 
 from loopclosure.cli import app
 from loopclosure.cli.console import print_json, progress_bars, say
-from loopclosure.cli.options import Json, Quiet
+from loopclosure.cli.options import Json, Quiet, parse_pair
 from loopclosure.config import Config
-from loopclosure.errors import ConfigError
 from loopclosure.evaluation.tables import NanPoses
 
 if TYPE_CHECKING:
@@ -65,7 +64,7 @@ def reproduce(
     from loopclosure.report.experiments import results, write_experiments
     from loopclosure.runs import write_whole
 
-    settings = dict(map(_parse_pair, set_ or ()))
+    settings = dict(map(parse_pair, set_ or ()))
     flags = {
         "features.backbone": backbone,
         "features.weights": weights,
@@ -97,13 +96,6 @@ def reproduce(
     if result.note:
         say(f"the embedded network stands in: {result.note}", quiet=quiet)
     say(f"{result.computed} images passed the network; look at {page}", quiet=quiet)
-
-
-def _parse_pair(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not equals:
-        raise ConfigError(f"--set {text}: wants stage.field=value, such as --set sequence.length=5")
-    return name.strip(), value.strip()
 
 
 def _print_tables(result: Reproduction, *, quiet: bool) -> None:

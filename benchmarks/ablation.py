@@ -26,11 +26,11 @@ PARTS = {
     "no whitening (and a threshold)": {"aggregation.components": 0},
     "128 whitened numbers": {"aggregation.components": 128},
     "nothing taken out (and a threshold)": {"aggregation.centre_window": 0},
-    "no KL before NetVLAD": {"compression.reading": "none"},
-    "gamma 0": {"compression.gamma": 0.0},
-    "gamma 0.8": {"compression.gamma": 0.8},
-    "gamma 0.9": {"compression.gamma": 0.9},
-    "gamma auto": {"compression.gamma": "auto"},
+    "KL before NetVLAD, gamma 0": {"compression.gamma": 0.0},
+    "KL before NetVLAD, gamma 0.6": {"compression.gamma": 0.6},
+    "KL before NetVLAD, gamma 0.8": {"compression.gamma": 0.8},
+    "KL before NetVLAD, gamma 0.9": {"compression.gamma": 0.9},
+    "KL before NetVLAD, gamma auto": {"compression.gamma": "auto"},
     "32 clusters": {"aggregation.clusters": 32},
 }
 

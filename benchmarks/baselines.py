@@ -53,6 +53,16 @@ class Remembered:
         return self._known[key]
 
 
+def kind_of(name):
+    """What the features of a method are shared under: fabmap and the bags of words have the same."""
+    return "words" if name in ("fabmap", "bow", "bow-incremental") else name
+
+
+def data_argument(parser):
+    default = os.environ.get("LOOPCLOSURE_TEST_DATA", Path(__file__).parents[2] / "shared" / "data")
+    parser.add_argument("--data", type=Path, default=Path(default))
+
+
 def make_detector(config, model, features=None):
     detector = LoopDetector(config, model=model)
     if features is not None:
@@ -151,8 +161,7 @@ TABLES = {
 def main():
     runnable = [name for name, entry in METHODS.items() if name != "onnx" and entry.weights in ("", EMBEDDED)]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    default = os.environ.get("LOOPCLOSURE_TEST_DATA", Path(__file__).parents[2] / "shared" / "data")
-    parser.add_argument("--data", type=Path, default=Path(default))
+    data_argument(parser)
     parser.add_argument("--methods", default=",".join(runnable))
     parser.add_argument("--only", choices=["accuracy", "cost"])
     arguments = parser.parse_args()
@@ -164,8 +173,7 @@ def main():
                 continue
             print(f"\n{title}: {columns}")
             for name in arguments.methods.split(","):
-                # fabmap and the bags of words have the same features
-                kind = "words" if name in ("fabmap", "bow", "bow-incremental") else name
+                kind = kind_of(name)
                 if kind not in known:
                     known[kind] = Remembered(make_detector(Config(method=name), None).method.features)
                 model = Path(folder) / name

@@ -24,6 +24,7 @@ from loopclosure.verification import Verifier
 
 LENGTHS = 10, 5, 1
 RIGHT, WRONG, TOLERANCE = 3, 10, 2
+BARS = 2.0, 3.0, 4.0, 5.0
 PAIRS = {
     "day": ("gardens_point/day_left", "gardens_point/day_right"),
     "night": ("gardens_point/day_right", "gardens_point/night_right"),
@@ -127,7 +128,7 @@ def label(rows):
     return np.where(loop & ~full, -1, np.where(off <= RIGHT, 1, np.where(off > WRONG, 0, -1)))
 
 
-def fit(rows, groups):
+def fit(rows):
     labels = label(rows)
     kept = labels >= 0
     case = rows[:, 0] * 100 + rows[:, 1]
@@ -184,19 +185,16 @@ def main():
     report(names, np.array(groups), rows)
 
 
-BARS = 2.0, 3.0, 4.0, 5.0
-
-
 def report(names, groups, rows):
     group = groups[rows[:, 0].astype(int)]
-    weights, constant = fit(rows, group)
+    weights, constant = fit(rows)
     print("\nfitted on all:", " ".join(f"{weight:.3f}" for weight in weights), f"constant {constant:.3f}")
-    held = {one: fit(rows[group != one], group[group != one]) for one in np.unique(groups)}
+    held = {one: fit(rows[group != one]) for one in np.unique(groups) if (group != one).any()}
     for length in LENGTHS:
         print(
             f"\nsequences of {length}: top-1, recall at 100 % precision, then recall and false loops at log-odds", BARS
         )
-        for how in ("fitted on all", "its group left out"):
+        for how in ("fitted on all", "its group left out")[: 1 + bool(held)]:
             totals = []
             for case, name in enumerate(names):
                 of = rows[(rows[:, 0] == case) & (rows[:, 1] == length)]

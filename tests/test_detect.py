@@ -86,7 +86,7 @@ def test_learns_anew_at_the_milestones_and_says_so(two_laps):
 
 def test_a_loop_must_be_led_up_to(two_laps):
     first_full = 24 + 3
-    decisions = list(LoopDetector(small(decision__consistency=6)).detect(two_laps))
+    decisions = list(LoopDetector(small(decision__consistency=6, aggregation__components=0)).detect(two_laps))
     assert all(d.reason is Reason.INCONSISTENT and not d.accepted for d in decisions[first_full : first_full + 4])
     assert all(d.accepted for d in decisions[first_full + 5 :])
 
@@ -235,11 +235,11 @@ def test_a_saved_map_serves_as_reference(tmp_path):
 
 
 def test_model_is_used_and_guarded(tmp_path):
-    teacher = LoopDetector(small())
+    teacher = LoopDetector(small(compression__gamma=0.6))
     teacher.fit(make_lap(24), source="lap")
     teacher.save_model(tmp_path / "model")
     pupil = LoopDetector(model=tmp_path / "model")
-    assert pupil.config == small()
+    assert pupil.config == small(compression__gamma=0.6)
     assert pupil.learned_on == ["24 of 24 frames of the lap"]
     assert pupil.add(make_lap(1)[0]).reason is Reason.TOO_RECENT
     with pytest.raises(ModelError, match=r"compression\.gamma = 0\.6, wanted 0\.9"):

@@ -62,7 +62,9 @@ class Features(Section):
 class Compression(Section):
     """The Karhunen-Loeve transform (paper 2.2). One of `gamma`, `energy` and `components` rules."""
 
-    reading: Literal["channel", "sequence", "flat", "none"] = Field("channel", description="how Eq. 5-16 are read")
+    reading: Literal["channel", "sequence", "flat", "none"] = Field(
+        "none", description="how Eq. 5-16 are read in front of NetVLAD; a ratio that is set makes it 'channel'"
+    )
     gamma: Annotated[float, Field(ge=0, lt=1)] | Literal["auto"] | None = Field(
         0.6, description="share of the eigenvectors that is cut away (Eq. 16); 'auto' chooses it from the images"
     )
@@ -116,12 +118,6 @@ class Sequence(Section):
     direction: Literal["forward", "both"] = Field("forward", description="'both' also finds a street driven back")
 
 
-class Index(Section):
-    """How a new frame is compared with a large map."""
-
-    flat_up_to: int = Field(50_000, ge=1000, description="places beyond which short codes are compared first")
-
-
 class SeqSlam(Section):
     """Thumbnails of the method `seqslam`."""
 
@@ -150,7 +146,7 @@ class Decide(Section):
     """From the best score to a decision."""
 
     false_loops_per_1000: float = Field(
-        1.0, gt=0, le=1000, description="false loops that are allowed in 1000 frames, where a score is a probability"
+        0.5, gt=0, le=1000, description="false loops that are allowed in 1000 frames, where a score is a probability"
     )
     threshold: float | None = Field(
         None, description="least score of a loop; none = by false_loops_per_1000, or the method's own"
@@ -234,7 +230,6 @@ class Config(Section):
     aggregation: Aggregation = Aggregation()
     learning: Learning = Learning()
     sequence: Sequence = Sequence()
-    index: Index = Index()
     decision: Decide = Decide()
     verification: Verification = Verification()
     seqslam: SeqSlam = SeqSlam()
@@ -313,6 +308,8 @@ class Config(Section):
             values["features"]["layer"] = None
         if any(settings.get(f"compression.{rule}") not in (None, "none") for rule in _RULES):
             values["compression"].update(dict.fromkeys(_RULES))
+            if values["compression"]["reading"] == "none" and settings.get("method", self.method) in _COMPRESSING:
+                values["compression"]["reading"] = "channel"
         for name, value in settings.items():
             if name not in known:
                 raise ConfigError(f"unknown setting '{name}'{did_you_mean(name, known)}")
@@ -323,6 +320,7 @@ class Config(Section):
 
 
 _RULES = ("gamma", "energy", "components")
+_COMPRESSING = ("kl-netvlad", "onnx")  # a ratio alone says that local vectors are to be compressed
 _LAYERS = {EMBEDDED: "s16", "fasterrcnn_resnet50_fpn": "fpn", "onnx": "output"}
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -330,6 +328,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "features.backbone": "resnet152",
         "features.layer": "conv5",
+        "compression.reading": "channel",
         "compression.gamma": 0.8,
         "aggregation.clusters": 64,
         "aggregation.centre_window": 0,
@@ -406,7 +405,7 @@ def _parse(name: str, value: Any) -> Any:
 def one_line(error: ValidationError, known: Iterable[str] = ()) -> str:
     """Say what the first problem of a validation is, in one line, with a guess for an unknown name."""
     first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
+    where = ".".join(str(part) for part in first["loc"][:2])  # behind them: which of several types was tried
     message = str(first["msg"]).removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
         return f"unknown setting '{where}'{did_you_mean(where, known)}"

@@ -19,13 +19,13 @@ class Reason(str, Enum):
     TOO_RECENT = "too_recent"
     """Every earlier frame is nearer than ``exclude_recent``: nothing can be a loop yet."""
     BELOW_THRESHOLD = "below_threshold"
-    """There is a best candidate, but it is not similar enough."""
+    """There is a best candidate, but too little speaks for it."""
     INCONSISTENT = "inconsistent"
-    """The candidate is similar enough, but the best candidates of the frames before do not lead up to it."""
+    """It would be a loop, had the candidate moved on with the robot for longer."""
     SEQUENCE_TOO_SHORT = "sequence_too_short"
     """Fewer frames than one sequence stand behind this frame, or behind every candidate."""
     NOT_VERIFIED = "not_verified"
-    """The candidate was similar enough, but the geometry of the two images does not agree."""
+    """It would be a loop, did one camera motion explain both views."""
     UNREADABLE = "unreadable"
     """The image could not be decoded and ``on_error`` is ``skip``."""
 
@@ -44,7 +44,8 @@ class Decision:
     match : int or None
         0-based position of the best candidate, accepted or not; None where there is no candidate.
     score : float or None
-        Similarity of the two sequences, larger = more alike; None where there is no candidate.
+        What decides, larger = more likely a loop: the probability of a loop, or, of methods that are not calibrated,
+        the similarity of the two sequences. None where there is no candidate.
     accepted : bool
         Whether the pair is reported as a loop.
     inliers : int or None

@@ -174,11 +174,12 @@ def _go_through(
                 if checkpoint.due():
                     scores.flush()
                     checkpoint.save(state, images)
-    except (Exception, Stopped):
+    except (Exception, Stopped) as error:
         if 0 < detector.frames == len(loops.decisions):  # else a frame is half done, and the last state counts
             scores.flush()
             checkpoint.save(state, images)
-            _log.warning("stopped after %d frames; `detect --resume` goes on from there", detector.frames)
+            level = logging.WARNING if isinstance(error, Stopped) else logging.INFO  # an error speaks for itself
+            _log.log(level, "stopped after %d frames; `detect --resume` goes on from there", detector.frames)
         raise
 
 

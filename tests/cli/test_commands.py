@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import sys
 
 import cv2
@@ -283,4 +284,4 @@ def test_help_shows_examples(run, command):
 
 def test_help_shows_the_defaults_of_the_configuration(run):
     out = run("detect", "--help")[1]
-    assert "(default: 10)" in out.replace("\n", " ")
+    assert "(default: 10)" in re.sub(r"[\s│]+", " ", out)

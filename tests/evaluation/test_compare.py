@@ -18,6 +18,7 @@ from loopclosure.evaluation import evaluate_run
 from loopclosure.evaluation.compare import compare_methods, config_for, method_names, milliseconds_a_frame
 from loopclosure.methods import METHODS
 from loopclosure.report.comparison import PAGE, TABLE, write_comparison
+from loopclosure.runs import fit_model
 from loopclosure.store import HEADER
 
 SMALL = {
@@ -108,7 +109,9 @@ def test_every_row_is_what_evaluate_says_of_the_run_folder(run, drive, truth, tm
 def test_milliseconds_leave_learning_out_and_count_the_references():
     seconds = {"features": 3.0, "learn": 100.0, "describe": 0.2, "match": 0.4, "total": 200.0}
     assert milliseconds_a_frame({"seconds": seconds, "frames": 10, "references": None}) == pytest.approx(360)
-    assert milliseconds_a_frame({"seconds": seconds, "frames": 10, "references": 20}) == pytest.approx(160)
+    against = {"seconds": seconds, "frames": 10, "references": 20}
+    assert milliseconds_a_frame(against) == pytest.approx(160)
+    assert milliseconds_a_frame(against, map_was_saved=True) == pytest.approx(360)
 
 
 def test_the_embedded_network_stands_in_and_what_cannot_run_says_why(run, no_downloads, drive, truth, tmp_path):
@@ -122,6 +125,8 @@ def test_the_embedded_network_stands_in_and_what_cannot_run_says_why(run, no_dow
     for name in ("faster-rcnn", "onnx"):
         assert rows[name]["top1"] == rows[name]["mark"] == ""
     assert "loopclosure weights fetch fasterrcnn-coco" in rows["faster-rcnn"]["note"]
+    assert "--weights faster-rcnn=random" in rows["faster-rcnn"]["note"]
+    assert "=random" not in rows["netvlad-vgg16"]["note"]
     assert "onnx.path" in rows["onnx"]["note"]
     assert rows["seqslam"]["top1"] != ""
     assert rows["seqslam"]["mark"] == ""
@@ -155,6 +160,50 @@ def test_random_weights_and_another_backbone_are_marked(run, drive, truth, tmp_p
     info = json.loads((tmp_path / "netvlad-vgg16" / "run.json").read_text())
     assert info["config"]["features"]["backbone"] == "resnet18"
     assert info["config"]["features"]["layer"] == "conv5"
+
+
+def test_weights_of_one_method(run, no_downloads, drive, truth, tmp_path):
+    given = ["--methods", "faster-rcnn,cnn", "--weights", "faster-rcnn=random", "--out", tmp_path]
+    code, out, err = run(drive, "--truth", truth, *given, *FAST)
+    assert (code, err) == (0, "")
+    rows = rows_of(tmp_path)
+    assert (rows["faster-rcnn"]["mark"], rows["cnn"]["mark"]) == ("random weights", "")
+    assert rows["faster-rcnn"]["top1"] != ""
+    assert rows["cnn"]["weights"] == "efficientnet-lite0"
+    assert re.search("^faster-rcnn .* random weights$", out, re.M)
+    assert "<mark>random weights</mark>" in (tmp_path / PAGE).read_text()
+
+
+@pytest.mark.parametrize("flag", ["--weights", "--model"])
+def test_what_is_for_one_method_names_a_method_that_runs(run, drive, truth, tmp_path, flag):
+    out = tmp_path / "out"
+    for given, said in (("sqslam=x", "did you mean 'seqslam'"), ("cnn=x", "not among the methods")):
+        code, _, err = run(drive, "--truth", truth, "--methods", "seqslam", flag, given, "--out", out)
+        assert code == 1
+        assert said in err
+        assert err.count("\n") == 1
+    assert not out.exists()
+
+
+def test_models_that_were_fitted_before(run, drive, truth, tmp_path):
+    words = {"words.branching": 4, "words.side": 64, "words.max_features": 50}
+    config = Config().with_settings(SMALL | words | {"method": "bow"})
+    fit_model(drive, tmp_path / "words", config=config)
+    given = ["--methods", "bow,fabmap,seqslam", "--model", f"bow={tmp_path / 'words'}", "--out", tmp_path / "out"]
+    settings = [part for name, value in words.items() for part in ("--set", f"{name}={value}")]
+    code, _, err = run(drive, "--truth", truth, *given, "--model", f"fabmap={tmp_path / 'none'}", *FAST, *settings)
+    assert (code, err) == (0, "")
+    rows = rows_of(tmp_path / "out")
+    assert rows["bow"]["learned_on"] == f"20 of 20 frames of the {drive.name}"
+    assert "none" in rows["fabmap"]["note"]
+    assert rows["fabmap"]["top1"] == ""
+    assert rows["seqslam"]["top1"] != ""
+
+
+def test_a_model_without_a_method_is_refused(run, drive, truth, tmp_path):
+    code, _, err = run(drive, "--truth", truth, "--model", tmp_path, "--out", tmp_path / "out")
+    assert code == 1
+    assert "METHOD=MODEL" in err
 
 
 def test_a_backbone_is_for_methods_that_run_on_maps():

@@ -11,13 +11,8 @@ from scipy.ndimage import gaussian_filter
 
 from loopclosure.errors import ConfigError, ModelError
 from loopclosure.features.thumbnails import normalise_patches, thumbnails
-from loopclosure.matching.differences import (
-    difference_matrix,
-    difference_row,
-    enhance_contrast,
-    enhance_row,
-    relative_differences,
-)
+from loopclosure.matching.correlation import CorrelationMap
+from loopclosure.matching.differences import difference_matrix, difference_row, enhance_contrast, enhance_row
 from loopclosure.matching.velocities import TrajectorySearch, search, uniqueness
 
 
@@ -76,33 +71,12 @@ class TestDifferences:
         assert difference_matrix(low, high).item() == difference_matrix(high, low).item() == 510
         assert difference_row(low[0], high).item() == difference_row(high[0], low).item() == 510
 
-    @pytest.mark.parametrize("shifts", [(0,), (-2, 0, 1), (3,)])
-    def test_shifted_images_are_compared_where_they_overlap(self, shifts):
-        rng = np.random.default_rng(1)
-        queries, references = rng.normal(size=(2, 3, 5)), rng.normal(size=(4, 3, 5))
-        expected = np.empty((2, 4))
-        for i, query in enumerate(queries):
-            for j, reference in enumerate(references):
-                least = math.inf
-                for shift in shifts:
-                    pairs = [(x + shift, x) for x in range(5) if 0 <= x + shift < 5]
-                    total = sum(abs(query[y, a] - reference[y, b]) for a, b in pairs for y in range(3))
-                    least = min(least, total * 5 / len(pairs))
-                expected[i, j] = least / 4
-        np.testing.assert_allclose(difference_matrix(queries, references, shifts=shifts), expected, rtol=1e-5)
-
-    def test_a_camera_that_looks_aside_is_found_by_shifting(self):
-        wide = np.random.default_rng(2).normal(size=(1, 8, 20))
-        assert difference_matrix(wide[:, :, 3:19], wide[:, :, :16], shifts=(-3, 0, 3)).item() == 0
-        assert difference_matrix(wide[:, :, 3:19], wide[:, :, :16]).item() > 0.5 * 8 * 16
-
     @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
-    @pytest.mark.parametrize("shifts", [(0,), range(-4, 5, 2)])
-    def test_a_row_is_a_row_of_the_matrix(self, dtype, shifts):
+    def test_a_row_is_a_row_of_the_matrix(self, dtype):
         rng = np.random.default_rng(3)
         images = (100 * rng.random(size=(130, 8, 16))).astype(dtype)
-        matrix = difference_matrix(images[:2], images, shifts=shifts)
-        rows = [difference_row(query, images, shifts=shifts) for query in images[:2]]
+        matrix = difference_matrix(images[:2], images)
+        rows = [difference_row(query, images) for query in images[:2]]
         np.testing.assert_allclose(rows, matrix, rtol=1e-5, atol=1e-5)
         assert rows[0].dtype == matrix.dtype == np.float32
 
@@ -112,7 +86,7 @@ class TestDifferences:
         matrix = difference_matrix(queries, references)
         assert matrix.shape == enhance_contrast(matrix).shape == (m, n)
         assert difference_row(np.zeros((2, 4), np.float32), references).shape == (n,)
-        assert enhance_row(np.zeros(n)).shape == relative_differences(np.zeros(n)).shape == (n,)
+        assert enhance_row(np.zeros(n)).shape == (n,)
         assert search(matrix)[0].tolist() == [-1] * m
 
     def test_thumbnails_of_different_sizes_are_refused(self):
@@ -120,11 +94,6 @@ class TestDifferences:
             difference_matrix(np.zeros((1, 2, 4)), np.zeros((1, 4, 2)))
         with pytest.raises(ModelError, match="made alike"):
             difference_row(np.zeros((2, 4)), np.zeros((1, 2, 8)))
-
-    @pytest.mark.parametrize("shifts", [(), (0, 4), (-4,)])
-    def test_shifts_that_leave_nothing_are_refused(self, shifts):
-        with pytest.raises(ConfigError, match="shifts"):
-            difference_matrix(np.zeros((1, 2, 4)), np.zeros((1, 2, 4)), shifts=shifts)
 
 
 class TestContrast:
@@ -147,18 +116,10 @@ class TestContrast:
     def test_equal_differences_have_no_contrast(self, value):
         assert (enhance_row(np.full(30, value)) == 0.5).all()
         assert (enhance_contrast(np.full((2, 30), value)) == 0).all()
-        assert (relative_differences(np.full(30, value)) == pytest.approx(1)) is True
 
     def test_scale_and_offset_of_a_row_do_not_matter(self):
         row = np.random.default_rng(5).uniform(1, 2, 50)
         np.testing.assert_allclose(enhance_row(3 * row + 100), enhance_row(row), atol=1e-5)
-        np.testing.assert_allclose(relative_differences(3 * row), relative_differences(row), rtol=1e-5)
-
-    def test_blank_references_are_neither_alike_nor_different(self):
-        differences = np.array([2.0, 0.0, 4.0, 0.0])
-        blank = np.array([False, True, False, True])
-        np.testing.assert_allclose(relative_differences(differences, blank), [2 / 3, 1, 4 / 3, 1], rtol=1e-6)
-        assert relative_differences(differences, np.ones(4, bool)).tolist() == [1] * 4
 
     def test_a_neighbourhood_of_one_is_refused(self):
         with pytest.raises(ConfigError, match="radius"):
@@ -276,24 +237,28 @@ class TestDrives:
         right = np.abs(matches - expected)[5:85] <= (0 if speed == 1 else 2)
         assert right.mean() > 0.97
 
-    @pytest.mark.parametrize(("contrast", "share"), [(enhance_row, 0.97), (relative_differences, 1)])
+    @pytest.mark.parametrize(("correlated", "share"), [(False, 0.97), (True, 1)])
     @pytest.mark.parametrize("speed", [0.8, 0.9, 1.0, 1.1, 1.2])
-    def test_online_too(self, speed, contrast, share):
+    def test_online_too(self, speed, correlated, share):
         references = self.drive(1, 120)
+        places = CorrelationMap()
+        for reference in references:
+            places.add(reference)
         trajectories = TrajectorySearch()
         right = []
         for frame, query in enumerate(self.drive(speed, 90, gain=1.5, offset=60)):
-            scores = trajectories.push(contrast(difference_row(query, references)))
+            row = -places.similarities(query) if correlated else enhance_row(difference_row(query, references))
+            scores = trajectories.push(row)
             if frame >= 13:  # even a drive at 0.8 of the speed has a whole trajectory behind it
                 right.append(abs(np.nanargmax(scores) - speed * frame) < (0.5 if speed == 1 else 1.5))
         assert np.mean(right) >= share
 
     def test_finds_the_second_lap_of_one_stream(self):
         lap = self.drive(1, 60)
-        stream = np.concatenate([lap, lap])
-        trajectories = TrajectorySearch()
-        for frame, query in enumerate(stream):
-            scores = trajectories.push(relative_differences(difference_row(query, stream[: max(frame - 29, 0)])))
+        places, trajectories = CorrelationMap(exclude_recent=30), TrajectorySearch()
+        for frame, query in enumerate([*lap, *lap]):
+            scores = trajectories.push(-places.similarities(query))
+            places.add(query)
             if frame >= 71:
                 assert np.nanargmax(scores) == frame - 60
 

@@ -180,8 +180,8 @@ def test_the_table_tells_the_length_of_a_descriptor(name, lap):
     method = build_method(Config().with_settings({"method": name} | small | own))
     shape = method.features(lap[:1])[0].shape
     rng = np.random.default_rng(0)
-    method.fit([rng.random(shape, np.float32) for _ in range(420 if name == "cnn-pca" else 40)])
-    assert method.blank().size == METHODS[name].numbers
+    method.fit([rng.random(shape, np.float32) for _ in range(420 if name == "cnn-pca" else 80)])
+    assert np.size(method.reduce(method.blank())) == METHODS[name].numbers
 
 
 def test_the_table_names_the_weights_that_the_settings_choose():

@@ -8,9 +8,9 @@ import pytest
 from loopclosure import Config, ImageSequence, LoopDetector
 from loopclosure.errors import ConfigError
 from loopclosure.features.thumbnails import thumbnails
-from loopclosure.matching.differences import difference_matrix, enhance_row, relative_differences
+from loopclosure.matching.differences import difference_matrix, enhance_row
 from loopclosure.methods import build_method
-from loopclosure.methods.seqslam import ThumbnailMap
+from loopclosure.methods.seqslam import ContrastMap
 
 
 def seqslam(**settings):
@@ -18,33 +18,18 @@ def seqslam(**settings):
     return Config().with_settings({"method": "seqslam", **settings})
 
 
-def fill(places, stack):
-    for thumbnail in stack:
-        places.add(thumbnail)
-    return places
-
-
 @pytest.mark.parametrize("n", [3, 1023, 1024, 1050, 1100])
-@pytest.mark.parametrize("local_contrast", [False, True])
-def test_a_row_is_that_of_all_candidates_together(n, local_contrast):
+def test_a_row_is_that_of_all_candidates_together(n):
     stack = np.random.default_rng(n).normal(size=(n + 1, 4, 20)).astype(np.float32)
-    stack[n // 2] = 0
     exclude = 31
-    places = fill(ThumbnailMap(exclude_recent=exclude, local_contrast=local_contrast), stack[:n])
+    places = ContrastMap(exclude_recent=exclude)
+    for thumbnail in stack[:n]:
+        places.add(thumbnail)
     row = places.similarities(stack[n])
     candidates = [j for j in range(n) if n - j >= exclude]
     assert np.isneginf(np.delete(row, candidates)).all()
-    if local_contrast:
-        wanted = enhance_row(difference_matrix(stack[n:], stack[candidates])[0])
-    else:
-        differences = difference_matrix(stack[n:], stack[candidates], shifts=range(-8, 9, 2))[0]
-        wanted = relative_differences(differences, blank=~stack[candidates].any(axis=(1, 2)))
+    wanted = enhance_row(difference_matrix(stack[n:], stack[candidates])[0])
     np.testing.assert_allclose(row[candidates], 1 - wanted, atol=1e-4)
-
-
-def test_a_blank_frame_is_as_unlike_one_reference_as_another():
-    places = fill(ThumbnailMap(), np.random.default_rng(0).normal(size=(5, 4, 20)).astype(np.float32))
-    assert places.similarities(np.zeros((4, 20), np.float32)).tolist() == [0] * 5
 
 
 @pytest.mark.parametrize("length", [1, 2, 5])
@@ -54,7 +39,8 @@ def test_a_sequence_has_so_many_frames(lap, length):
     decisions = list(detector.detect(lap))
     first = next(d.query for d in decisions if d.match is not None)
     assert first == max(length - 1, 1)  # a trajectory has two frames at least
-    assert decisions[-1].score == pytest.approx(1, abs=1e-6)
+    best = [d.score for d in decisions if d.match is not None]
+    assert min(best) > 1  # standard deviations above the other places
 
 
 def test_faithful_thumbnails_are_openseqslams(lap):

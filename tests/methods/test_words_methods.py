@@ -10,8 +10,8 @@ from loopclosure.aggregation.words import EMPTY_BAG
 from loopclosure.errors import ConfigError, FitError, ModelError
 from loopclosure.features.keypoints import KeypointExtractor
 from loopclosure.matching.fabmap import FabMap
+from loopclosure.matching.standard import StandardScores
 from loopclosure.methods import build_method
-from loopclosure.methods.bag_of_words import StandardScores
 
 NAMES = ["fabmap", "bow", "bow-incremental"]
 TRAINED = ["fabmap", "bow"]

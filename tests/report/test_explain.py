@@ -21,7 +21,14 @@ from loopclosure.report.heatmaps import DescriptorNetwork, Explainer, View, clus
 from loopclosure.report.overlays import heat_overlay
 from loopclosure.runs import detect_loops
 
-SMALL = {"features.height": 64, "features.width": 64, "aggregation.clusters": 8, "sequence.length": 1}
+SMALL = {
+    "features.height": 64,
+    "features.width": 64,
+    "compression.reading": "channel",
+    "aggregation.clusters": 8,
+    "aggregation.components": 0,
+    "sequence.length": 1,
+}
 LAP = 30
 
 
@@ -38,6 +45,7 @@ def images(folder):
 
 
 def fitted(images, **settings):
+    settings = {"compression__reading": "channel"} | settings
     detector = LoopDetector(Config().with_settings({name.replace("__", "."): v for name, v in settings.items()}))
     detector.fit(images, source="test")
     return detector.method
@@ -171,7 +179,7 @@ def test_an_overlay_is_brighter_where_it_is_hot():
 
 def numbers_of(page):
     """Score of the sequence and of the frames alone, of each pair of a page."""
-    found = re.findall(r"Score of the sequence (-?[\d.]+), [\w ]+\. Score of the two frames alone (-?[\d.]+),", page)
+    found = re.findall(r"Score (-?[\d.]+), [\w ]+\. Score of the two frames alone (-?[\d.]+),", page)
     return np.array(found, float).reshape(-1, 2)
 
 

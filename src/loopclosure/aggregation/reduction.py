@@ -57,6 +57,7 @@ class Reduction:
         energies = kl.energies_
         scale = 1 / np.sqrt(energies[: kl.n_components_] + max(energies.mean(), np.finfo(np.float32).tiny))
         self.basis_ = (kl.basis_ * scale[:, None]).astype(np.float32)
+        self.energies_ = energies
         return self
 
     def transform(self, descriptor: np.ndarray) -> np.ndarray:
@@ -67,11 +68,11 @@ class Reduction:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return what was learned, for `loopclosure.store`."""
-        return {"basis": self.basis_}
+        return {"basis": self.basis_, "energies": self.energies_}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Reduction:
         """Rebuild what `to_arrays` gave."""
         reduction = cls(len(arrays["basis"]))
-        reduction.basis_ = arrays["basis"]
+        reduction.basis_, reduction.energies_ = arrays["basis"], arrays["energies"]
         return reduction

@@ -83,7 +83,8 @@ class VocabularyTree:
     iterations : int
         Of k-means, at most.
     max_samples : int
-        At most so many descriptors are clustered, a random choice where there are more.
+        At most so many descriptors are clustered, a random choice where there are more; the rarity of words comes from
+        all of them.
     seed : int
         Of that choice and of the start.
 
@@ -229,10 +230,15 @@ class VocabularyTree:
         return self.word_[node]
 
     def _nearest_child(self, node: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-        place = np.arange(self.children_[node].max())
-        child = self.first_child_[node][:, None] + np.minimum(place, self.children_[node][:, None] - 1)
-        closeness = np.matmul(self._vectors[child], vectors[:, :, None])[:, :, 0] - self._half[child]
-        return child[np.arange(len(node)), closeness.argmax(1)]
+        child = np.empty_like(node)
+        order = np.argsort(node, kind="stable")
+        starts = np.flatnonzero(np.diff(node[order], prepend=-1))
+        for rows in np.split(order, starts[1:]):
+            parent = node[rows[0]]
+            below = slice(self.first_child_[parent], self.first_child_[parent] + self.children_[parent])
+            closeness = vectors[rows] @ self._vectors[below].T - self._half[below]
+            child[rows] = below.start + closeness.argmax(1)
+        return child
 
     def transform(self, descriptors: np.ndarray) -> BagOfWords:
         """Return the bag of words of one image, weighted by tf-idf.

@@ -39,7 +39,7 @@ class MethodResult:
     curve : PrecisionRecall or None
         Precision over recall.
     milliseconds : float or None
-        Time an image, one at a time: features, descriptor and search, without reading and learning.
+        Time an image: features, descriptor and search, without reading and learning.
     info : dict
         Content of ``run.json``; empty if the method could not run.
     mark : str
@@ -99,6 +99,8 @@ def compare_methods(
     reference: str | os.PathLike[str] | None = None,
     config: Config | None = None,
     backbone: str | None = None,
+    weights: Mapping[str, str] | None = None,
+    models: Mapping[str, str | os.PathLike[str]] | None = None,
     tolerance: int = 0,
     truth_settings: Mapping[str, Any] | None = None,
     progress: RunProgress | None = None,
@@ -121,6 +123,10 @@ def compare_methods(
         Settings of all methods. What a method's name says of its network goes before it.
     backbone : str, optional
         The network of every method that runs on feature maps, whatever its name says.
+    weights : mapping, optional
+        Weights of single methods by their names, as for ``features.weights``.
+    models : mapping, optional
+        Folders of fitted models by the names of their methods; the others learn from the reference or the drive.
     tolerance : int
         A match so many frames from a true one is right.
     truth_settings : mapping, optional
@@ -140,7 +146,11 @@ def compare_methods(
         If the images, the truth or the name of a method cannot be used.
     """
     config = config or Config()
+    weights, models = weights or {}, models or {}
     names = method_names(methods)
+    for name in (*weights, *models):
+        if name not in names:
+            raise ConfigError(f"'{name}' is not among the methods {', '.join(names)}{did_you_mean(name, names)}")
     size = _frames(source, reference, config)
     judged = truth if isinstance(truth, Truth) else _truth(truth, size, config, truth_settings)
     results = [
@@ -150,8 +160,9 @@ def compare_methods(
             judged,
             Path(out) / name,
             reference=reference,
-            config=config,
+            config=config.with_settings({"features.weights": weights[name]}) if name in weights else config,
             backbone=backbone,
+            model=models.get(name),
             tolerance=tolerance,
             progress=progress,
         )
@@ -213,22 +224,24 @@ def run_method(
     reference: str | os.PathLike[str] | None = None,
     config: Config,
     backbone: str | None = None,
+    model: str | os.PathLike[str] | None = None,
     tolerance: int,
     progress: RunProgress | None = None,
 ) -> MethodResult:
     """Run one method into `folder` and judge it; see `compare_methods`."""
     report = partial(_named, method, progress) if progress else None
+    detect = partial(detect_loops, source, folder, reference=reference, model=model, progress=report)
     note = ""
     try:
         wanted = config_for(method, config, backbone)
         try:
-            run = detect_loops(source, folder, reference=reference, config=wanted, progress=report)
+            run = detect(config=wanted)
         except WeightsError as error:
             if not replaceable(wanted):
                 raise
             note = f"{error}{_hint(method)}"
             stand_in = wanted.with_settings({"features.backbone": EMBEDDED})
-            run = detect_loops(source, folder, reference=reference, config=stand_in, progress=report)
+            run = detect(config=stand_in)
     except LoopClosureError as error:
         return MethodResult(method, note=f"{error}{_hint(method) if isinstance(error, WeightsError) else ''}")
     return judge_run(method, folder, run.info, truth, tolerance=tolerance, mark=_mark(method, wanted, run), note=note)
@@ -252,10 +265,18 @@ def config_for(method: str, config: Config, backbone: str | None = None) -> Conf
     return own.with_settings({"features.backbone": backbone, "features.layer": layer})
 
 
-def milliseconds_a_frame(info: Mapping[str, Any]) -> float:
-    """Return the time of the stages that every frame passes, without reading and learning, by ``run.json``."""
+def milliseconds_a_frame(info: Mapping[str, Any], *, map_was_saved: bool = False) -> float:
+    """Return the time of the stages that every frame passes, without reading and learning.
+
+    Parameters
+    ----------
+    info : mapping
+        Content of ``run.json``.
+    map_was_saved : bool
+        Whether the references came from a saved detector, whose features this run did not compute.
+    """
     seconds, frames = info["seconds"], info["frames"]
-    described = frames + (info["references"] or 0)
+    described = frames if map_was_saved else frames + (info["references"] or 0)
     return 1000 * (seconds["features"] / described + (seconds["describe"] + seconds["match"]) / frames)
 
 
@@ -289,8 +310,11 @@ def replaceable(config: Config) -> bool:
 
 
 def _hint(method: str) -> str:
-    weights = METHODS[method].weights
-    return f"; `loopclosure weights fetch {weights}` tries again" if weights else ""
+    own = METHODS[method].weights
+    hint = f"; `loopclosure weights fetch {own}` tries again" if own else ""
+    if own and not replaceable(Config(method=method)):
+        hint += f", `--weights {method}={RANDOM}` runs it untrained"
+    return hint
 
 
 def _mark(method: str, wanted: Config, run: Run) -> str:

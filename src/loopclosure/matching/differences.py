@@ -6,8 +6,6 @@ transposes of those here: rows are queries.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-
 import numpy as np
 from scipy.spatial.distance import cdist
 
@@ -17,19 +15,15 @@ _REFERENCES = 64  # so many stay in the processor's cache while they are compare
 _NUMBERS = 1 << 22  # in a temporary array
 
 
-def difference_matrix(queries: np.ndarray, references: np.ndarray, *, shifts: Sequence[int] = (0,)) -> np.ndarray:
+def difference_matrix(queries: np.ndarray, references: np.ndarray) -> np.ndarray:
     """Return the sum of absolute differences of every query and reference, divided by the number of references.
 
-    That divisor is OpenSeqSLAM's. Several `shifts`, which SeqSLAM does not have, compare the images where they overlap
-    after one was moved sideways, scaled to the whole width, and the least difference counts: a camera that looks a few
-    degrees aside or drives in the other lane still sees the same place. RatSLAM matches its views in this way.
+    That divisor is OpenSeqSLAM's.
 
     Parameters
     ----------
     queries : ndarray of float32 or uint8, shape (n_queries, height, width)
     references : ndarray of float32 or uint8, shape (n_references, height, width)
-    shifts : sequence of int
-        Pixels by which the queries are moved to the left; less than the width.
 
     Returns
     -------
@@ -40,46 +34,35 @@ def difference_matrix(queries: np.ndarray, references: np.ndarray, *, shifts: Se
     ------
     ModelError
         If queries and references differ in size.
-    ConfigError
-        If there is no shift, or nothing overlaps after one.
 
     Examples
     --------
     >>> difference_matrix(np.array([[[0, 3]]], np.uint8), np.array([[[1, 1]], [[0, 3]]], np.uint8)).tolist()
     [[1.5, 0.0]]
     """
-    differences = np.full((len(queries), len(references)), np.inf, np.float32)
-    for left, right, scale in _overlaps(queries.shape[1:], references.shape[1:], shifts):
-        moved = _flat(queries[:, :, left])
-        for start in range(0, len(references), _REFERENCES):
-            columns = differences[:, start : start + _REFERENCES]
-            sums = cdist(moved, _flat(references[start : start + _REFERENCES, :, right]), "cityblock")
-            np.minimum(columns, scale * sums, out=columns, casting="same_kind")
-    return differences / np.float32(max(len(references), 1))
+    _check_sizes(queries.shape[1:], references.shape[1:])
+    sums = cdist(_flat(queries), _flat(references), "cityblock")
+    return (sums / max(len(references), 1)).astype(np.float32)
 
 
-def difference_row(query: np.ndarray, references: np.ndarray, *, shifts: Sequence[int] = (0,)) -> np.ndarray:
+def difference_row(query: np.ndarray, references: np.ndarray) -> np.ndarray:
     """Return one row of `difference_matrix`, the way an online search needs it.
 
     Parameters
     ----------
     query : ndarray of float32 or uint8, shape (height, width)
     references : ndarray of float32 or uint8, shape (n_references, height, width)
-    shifts : sequence of int
-        Pixels by which the query is moved to the left.
 
     Returns
     -------
     ndarray of float32, shape (n_references,)
     """
+    _check_sizes(query.shape, references.shape[1:])
     query = query.astype(np.float32)  # uint8 differences would wrap round
-    overlaps = list(_overlaps(query.shape, references.shape[1:], shifts))
-    row = np.full(len(references), np.inf, np.float32)
+    row = np.empty(len(references), np.float32)
     for start in range(0, len(references), _REFERENCES):
-        block, least = references[start : start + _REFERENCES], row[start : start + _REFERENCES]
-        for left, right, scale in overlaps:
-            distance = np.abs(block[:, :, right] - query[:, left]).sum(axis=(1, 2))
-            np.minimum(least, np.float32(scale) * distance, out=least)
+        block = slice(start, start + _REFERENCES)
+        row[block] = np.abs(references[block] - query).sum(axis=(1, 2))
     return row / np.float32(max(len(references), 1))
 
 
@@ -132,36 +115,6 @@ def enhance_row(differences: np.ndarray, radius: int = 5) -> np.ndarray:
     return np.clip(0.5 + _local_contrast(differences[None], radius)[0] / np.float32(2 * bound), 0, 1)
 
 
-def relative_differences(differences: np.ndarray, blank: np.ndarray | None = None) -> np.ndarray:
-    """Divide the differences of one query by their mean over all references.
-
-    Deviation from SeqSLAM: local contrast throws away how much better one part of the route fits than another; this
-    keeps it and still takes out how different from everything a query is.
-
-    Parameters
-    ----------
-    differences : ndarray of float, shape (n_references,)
-    blank : ndarray of bool, shape (n_references,), optional
-        References without any structure, whose difference says nothing; all of them where the query has none.
-
-    Returns
-    -------
-    ndarray of float32, shape (n_references,)
-        0 for equal thumbnails, 1 = as the references are on average, or where nothing can be said.
-
-    Examples
-    --------
-    >>> relative_differences(np.array([1.0, 2.0, 3.0])).tolist()
-    [0.5, 1.0, 1.5]
-    """
-    relative = np.ones(len(differences), np.float32)
-    seen = np.ones(len(differences), bool) if blank is None else ~blank
-    total = differences[seen].sum(dtype=np.float64)
-    if total > 0:
-        relative[seen] = differences[seen] * (seen.sum() / total)
-    return relative
-
-
 def _local_contrast(differences: np.ndarray, radius: int) -> np.ndarray:
     if radius < 1:
         raise ConfigError(f"found a contrast radius of {radius}, wanted at least 1 reference")
@@ -188,18 +141,8 @@ def _flat(images: np.ndarray) -> np.ndarray:
     return images.reshape(len(images), images.shape[1] * images.shape[2]).astype(np.float64)
 
 
-def _overlaps(
-    queries: tuple[int, ...], references: tuple[int, ...], shifts: Sequence[int]
-) -> Iterator[tuple[slice, slice, float]]:
-    """Columns of query and reference that lie on each other after each shift, and the scale to the whole width."""
+def _check_sizes(queries: tuple[int, ...], references: tuple[int, ...]) -> None:
     if queries != references:
         raise ModelError(
             f"references are thumbnails of shape {references}, queries of {queries}; were they made alike?"
         )
-    width = queries[1]
-    if len(shifts) == 0 or max(abs(shift) for shift in shifts) >= width:
-        raise ConfigError(f"found shifts {list(shifts)}, wanted at least one, less than the thumbnail's {width} pixels")
-    for shift in shifts:
-        left = slice(max(shift, 0), width + min(shift, 0))
-        right = slice(max(-shift, 0), width + min(-shift, 0))
-        yield left, right, width / (width - abs(shift))

@@ -130,7 +130,7 @@ class TrajectorySearch:
         Parameters
         ----------
         differences : ndarray of float32, shape (n_references,)
-            From `enhance_row`: smaller = more alike; infinity where there is no candidate.
+            Smaller = more alike, such as from `enhance_row`; infinity where there is no candidate.
 
         Returns
         -------
@@ -147,8 +147,11 @@ class TrajectorySearch:
         padded = np.full((len(self._rows), reach + n), np.inf)
         for steps_back, row in enumerate(reversed(self._rows)):
             padded[steps_back, reach : reach + len(row)] = row[:n]
-        points = np.arange(reach, reach + n) - self._offsets[:, :, None]
-        costs = padded[np.arange(len(padded))[:, None], points].mean(axis=1).min(axis=0)
+        costs = np.full(n, np.inf)
+        for trajectory in reach - self._offsets:
+            points = (row[start : start + n] for row, start in zip(padded, trajectory, strict=True))
+            np.minimum(costs, sum(points), out=costs)
+        costs /= len(padded)
         return np.where(np.isfinite(costs), -costs, np.nan).astype(np.float32)
 
     def to_arrays(self) -> dict[str, np.ndarray]:

@@ -116,7 +116,7 @@ METHODS: dict[str, MethodEntry] = {
         "KL basis and clusters, on the drive itself or by `fit`",
         _kl_netvlad,
         weights="efficientnet-lite0",
-        numbers=64 * 45,
+        numbers=64,
     ),
     "netvlad-resnet152": MethodEntry(
         "conv5 of ResNet-152 as a NetVLAD descriptor, uncompressed",
@@ -135,7 +135,7 @@ METHODS: dict[str, MethodEntry] = {
         numbers=64 * 512,
     ),
     "seqslam": MethodEntry(
-        "grey thumbnails compared pixel by pixel, trajectories of several speeds",
+        "grey thumbnails compared by correlation, trajectories of several speeds",
         "Milford & Wyeth, ICRA 2012",
         "nothing",
         _seqslam,

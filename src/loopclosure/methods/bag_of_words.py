@@ -11,10 +11,10 @@ from loopclosure.config import Config
 from loopclosure.errors import FitError, ModelError
 from loopclosure.features.keypoints import DESCRIPTOR_SIZES, KeypointExtractor
 from loopclosure.matching.inverted_index import BagOfWordsMap, IncrementalMap
-from loopclosure.matching.sequences import SequenceScores
+from loopclosure.matching.standard import StandardScores
 from loopclosure.methods.base import Method
 
-_LEAST_SPREAD = 1e-4  # of L1 scores or log-odds; below it they differ by rounding
+_REFIT_SAMPLES = 60_000  # local features; from these k-means takes a second
 
 
 class LocalFeatures:
@@ -58,23 +58,6 @@ def features_in(rows: np.ndarray) -> np.ndarray:
     return rows[rows.any(axis=1)]
 
 
-class StandardScores(SequenceScores):
-    """`SequenceScores` of similarities in standard deviations from the mean of the candidates of their frame.
-
-    How much two bags of one place have in common depends on the scene; how far they stand out depends on it less.
-    """
-
-    def push(self, similarities: np.ndarray) -> np.ndarray:
-        """Take the row of a new frame, float32 (n,), and return its sequence scores, NaN where there is no candidate.
-
-        A row that is the same everywhere counts as zeros.
-        """
-        row = np.asarray(similarities, np.float64)
-        candidates = row[: max(len(row) - max(self.exclude_recent - 1, 0), 0)]
-        spread = candidates.std() if len(candidates) else 0.0
-        return super().push((row - candidates.mean()) / spread if spread > _LEAST_SPREAD else np.zeros(len(row)))
-
-
 class BagOfWordsMethod(Method):
     """Compare images by the L1 score of their tf-idf weighted words (Galvez-Lopez & Tardos 2012).
 
@@ -95,6 +78,7 @@ class BagOfWordsMethod(Method):
 
     fitted = False
     threshold = 2.35
+    sums = StandardScores
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
@@ -106,7 +90,9 @@ class BagOfWordsMethod(Method):
         return self._local(images)
 
     def fit(self, features: Sequence[np.ndarray]) -> None:
-        """Learn the words and their rarity."""
+        """Learn the words and their rarity; anew from fewer features, because then a drive is waiting."""
+        if self.fitted:
+            self.vocabulary.max_samples = _REFIT_SAMPLES
         self.vocabulary.fit([features_in(rows) for rows in features])
         self.fitted = True
 
@@ -123,12 +109,6 @@ class BagOfWordsMethod(Method):
     def new_map(self, *, exclude_recent: int) -> BagOfWordsMap:  # noqa: ARG002  (each place is scored alone)
         """Return an empty map for bags of words."""
         return BagOfWordsMap()
-
-    def new_scores(self, *, exclude_recent: int) -> StandardScores:
-        """Return what sums standardised similarities over sequences."""
-        sequence = self.config.sequence
-        both = sequence.direction == "both"
-        return StandardScores(sequence.length, exclude_recent=exclude_recent, both_directions=both)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the vocabulary."""
@@ -155,6 +135,8 @@ class BagOfWordsMethod(Method):
 class IncrementalBagOfWords(Method):
     """Compare images by words that appear as the drive goes on: nothing is trained (Angeli et al. 2008).
 
+    The score of a loop is in standard deviations of the scores of a frame, see `StandardScores`.
+
     Deviations from the source: those of `IncrementalWords` and `IncrementalMap`.
 
     Parameters
@@ -163,7 +145,8 @@ class IncrementalBagOfWords(Method):
         Its sections `words` (but for the tree) and `sequence` are used.
     """
 
-    threshold = 0.095
+    threshold = 2.8
+    sums = StandardScores
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)

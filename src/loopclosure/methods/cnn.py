@@ -27,7 +27,7 @@ def cnn(
     config: Config,
     *,
     code: Code | None = None,
-    threshold: float = 0.72,
+    threshold: float = 2.2,
     progress: Callable[[int, int], None] | None = None,
 ) -> VectorMethod:
     """Build the method `cnn`, or one of its two relatives with a `code`."""
@@ -37,22 +37,24 @@ def cnn(
         return pool_cells(network.maps(images)[layer], CELLS)
 
     provenance = {"weights": network.weights_name, "weights_sha256": network.weights_sha256}
-    return VectorMethod(config, pooled, code=code, provenance=provenance, threshold=threshold)
+    method = VectorMethod(config, pooled, code=code, provenance=provenance, threshold=threshold)
+    method.input_size = network.preprocessing.size
+    return method
 
 
 def cnn_ae(config: Config, *, progress: Callable[[int, int], None] | None = None) -> VectorMethod:
     """Build the method `cnn-ae`: each cell through the bottleneck of an autoencoder, as long as KL's code."""
     rule = config.compression
-    if rule.energy is not None or rule.whiten:
-        raise ConfigError("cnn-ae knows compression.gamma and compression.components: an autoencoder has no spectrum")
+    if rule.energy is not None or rule.whiten or rule.gamma == "auto":
+        raise ConfigError("cnn-ae knows a number for compression.gamma, and compression.components, only")
     code = Autoencoder(gamma=rule.gamma, components=rule.components, seed=config.learning.seed)
-    return cnn(config, code=code, threshold=0.72, progress=progress)
+    return cnn(config, code=code, threshold=2.45, progress=progress)
 
 
 def cnn_pca(config: Config, *, progress: Callable[[int, int], None] | None = None) -> VectorMethod:
     """Build the method `cnn-pca`: scikit-learn's PCA of all cells together."""
     code = PooledPCA(**config.compression.model_dump(exclude={"reading"}))
-    return cnn(config, code=code, threshold=0.84, progress=progress)
+    return cnn(config, code=code, threshold=2.4, progress=progress)
 
 
 class PooledPCA:

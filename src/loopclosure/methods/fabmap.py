@@ -12,7 +12,8 @@ from loopclosure.config import Config
 from loopclosure.errors import FitError, ModelError
 from loopclosure.matching.fabmap import FabMap
 from loopclosure.matching.inverted_index import InvertedIndex
-from loopclosure.methods.bag_of_words import BagOfWordsMethod, StandardScores
+from loopclosure.matching.standard import StandardScores
+from loopclosure.methods.bag_of_words import BagOfWordsMethod
 from loopclosure.methods.base import Method
 from loopclosure.store import part
 
@@ -39,6 +40,7 @@ class FabMapMethod(Method):
 
     fitted = False
     threshold = 2.2
+    sums = StandardScores
 
     def __init__(self, config: Config) -> None:
         super().__init__(config)
@@ -71,10 +73,6 @@ class FabMapMethod(Method):
     def new_map(self, *, exclude_recent: int) -> FabMap:
         """Return a map without places."""
         return FabMap(self._tree, self._samples, exclude_recent=exclude_recent)
-
-    def new_scores(self, *, exclude_recent: int) -> StandardScores:
-        """Return what sums standardised log-odds over sequences."""
-        return self._words.new_scores(exclude_recent=exclude_recent)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return vocabulary, tree and samples."""

@@ -18,7 +18,7 @@ from loopclosure.errors import ConfigError
 from loopclosure.features.regions import BACKBONE, CHANNELS, RegionNetwork, Regions
 from loopclosure.methods.vectors import VectorMethod
 
-THRESHOLD = 0.8
+THRESHOLD = 2.4
 
 
 def faster_rcnn(config: Config, *, progress: Callable[[int, int], None] | None = None) -> VectorMethod:

@@ -7,7 +7,7 @@ from loopclosure.errors import ConfigError
 from loopclosure.features.onnx_network import OnnxNetwork
 from loopclosure.methods.vectors import VectorMethod
 
-THRESHOLD = 0.8
+THRESHOLD = 2.4
 
 
 def onnx(config: Config) -> VectorMethod:

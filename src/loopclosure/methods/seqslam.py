@@ -1,12 +1,13 @@
-"""SeqSLAM online: thumbnails compared pixel by pixel, and straight trajectories through the differences.
+"""SeqSLAM online: thumbnails compared patch by patch, and straight trajectories through the similarities.
 
 Milford and Wyeth, ICRA 2012; OpenSeqSLAM (2013). Deviations from it, beside those of `TrajectorySearch`:
 
-- Patches have 4 x 4 pixels and are not quantised, images are compared after sideways shifts of up to 8 pixels, and
-  differences are divided by their mean over the references instead of by local contrast. ``seqslam.faithful``
-  brings back 8 x 8 quantised patches, no shifts, and local contrast.
+- Patches have 4 x 4 pixels and are not quantised; images are compared by correlation after sideways shifts of up to 8
+  pixels instead of by absolute differences, and in standard deviations over all references instead of by local
+  contrast, see `CorrelationMap`. ``seqslam.faithful`` brings back 8 x 8 quantised patches, absolute differences
+  without shifts, and local contrast.
 - A trajectory has ``sequence.length`` frames: OpenSeqSLAM's ``ds = 10`` is a length of 11.
-- In one stream, frames nearer than ``sequence.exclude_recent`` are left out of the search and of the mean.
+- In one stream, frames nearer than ``sequence.exclude_recent`` are left out of the search and of the statistics.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ import numpy as np
 from loopclosure.config import Config
 from loopclosure.errors import ConfigError
 from loopclosure.features.thumbnails import thumbnails
-from loopclosure.matching.differences import difference_row, enhance_row, relative_differences
+from loopclosure.matching.correlation import CorrelationMap
+from loopclosure.matching.differences import difference_row, enhance_row
 from loopclosure.matching.similarity import VectorMap
 from loopclosure.matching.velocities import TrajectorySearch
 from loopclosure.methods.base import Method
@@ -29,8 +31,9 @@ _SHIFTS = range(-8, 9, 2)
 class SeqSLAM(Method):
     """Describe frames by patch-normalised thumbnails and match trajectories of several speeds.
 
-    A score is 1 less the mean difference along the best trajectory that ends at the candidate: 1 for equal frames,
-    0 (0.5 with local contrast) for frames as unlike as all references are on average.
+    A score is the mean along the best trajectory that ends at the candidate: of standard deviations by which the
+    correlation exceeds that of all candidates, 0 for frames that are as all of them are on average; with local
+    contrast of 1 less the difference, 1 for frames that stand out as far as can be, 0.5 for all others on average.
 
     Parameters
     ----------
@@ -48,7 +51,7 @@ class SeqSLAM(Method):
         if config.sequence.direction != "forward":
             raise ConfigError("sequence.direction = 'both': seqslam finds streets that are driven forward alone")
         self._faithful = config.seqslam.faithful
-        self.threshold = 0.84 if self._faithful else 0.25
+        self.threshold = 0.84 if self._faithful else 2.45
         self.features([])  # refuses sizes that cannot be cut into patches
 
     def features(self, images: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -65,30 +68,29 @@ class SeqSLAM(Method):
         """Return the thumbnail of an image without structure."""
         return np.zeros((self.config.seqslam.height, self.config.seqslam.width), np.float32)
 
-    def new_map(self, *, exclude_recent: int) -> ThumbnailMap:
+    def new_map(self, *, exclude_recent: int) -> ContrastMap | CorrelationMap:
         """Return an empty map for thumbnails."""
-        return ThumbnailMap(exclude_recent=exclude_recent, local_contrast=self._faithful)
+        if self._faithful:
+            return ContrastMap(exclude_recent=exclude_recent)
+        return CorrelationMap(shifts=_SHIFTS, exclude_recent=exclude_recent)
 
     def new_scores(self, *, exclude_recent: int) -> TrajectoryScores:  # noqa: ARG002  (the map leaves those frames out)
         """Return the search for trajectories of `sequence.length` frames, at least two."""
         return TrajectoryScores(ds=max(self.config.sequence.length - 1, 1))
 
 
-class ThumbnailMap(VectorMap):
-    """Thumbnails of all frames so far, compared by relative differences or by their local contrast.
+class ContrastMap(VectorMap):
+    """Thumbnails of all frames so far, compared by local contrast as OpenSeqSLAM does.
 
     Parameters
     ----------
     exclude_recent : int
         In one stream, frames nearer than this are no candidates; 0 for another traverse.
-    local_contrast : bool
-        Whether to compare as OpenSeqSLAM does, without shifts.
     """
 
-    def __init__(self, *, exclude_recent: int = 0, local_contrast: bool = False) -> None:
+    def __init__(self, *, exclude_recent: int = 0) -> None:
         super().__init__()
         self._excluded = max(exclude_recent - 1, 0)  # the new frame itself is not in the map yet
-        self._local_contrast = local_contrast
 
     def similarities(self, descriptor: np.ndarray) -> np.ndarray:
         """Compare one thumbnail with all stored ones.
@@ -104,22 +106,11 @@ class ThumbnailMap(VectorMap):
         """
         row = np.full(len(self), -np.inf, np.float32)
         candidates = max(len(self) - self._excluded, 0)
-        row[:candidates] = 1 - self._differences(descriptor, candidates)
-        return row
-
-    def _differences(self, thumbnail: np.ndarray, candidates: int) -> np.ndarray:
-        shifts = (0,) if self._local_contrast else _SHIFTS
-        row, blank = np.zeros(candidates, np.float32), np.zeros(candidates, bool)
-        start = 0
-        for block in self._filled():
-            block, end = block[: max(candidates - start, 0)], start + len(block)
+        if candidates:
             # difference_row divides by the length of the block, which must not tell on the result
-            row[start:end] = difference_row(thumbnail, block, shifts=shifts) * len(block)
-            blank[start:end] = ~block.any(axis=(1, 2))
-            start = end
-        if self._local_contrast:
-            return enhance_row(row)
-        return relative_differences(row, blank) if thumbnail.any() else np.ones_like(row)
+            sums = [difference_row(descriptor, block) * len(block) for block in self._filled()]
+            row[:candidates] = 1 - enhance_row(np.concatenate(sums)[:candidates])
+        return row
 
 
 class TrajectoryScores:
@@ -140,14 +131,14 @@ class TrajectoryScores:
         Parameters
         ----------
         similarities : ndarray of float32, shape (n,)
-            At most 1; minus infinity where there is no candidate.
+            Larger = more alike; minus infinity where there is no candidate.
 
         Returns
         -------
         ndarray of float32, shape (n,)
             Mean similarity along the best trajectory; NaN where none is complete.
         """
-        return 1 + self._search.push(1 - similarities)
+        return self._search.push(-similarities)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the state, for `loopclosure.store`."""

@@ -11,6 +11,7 @@ from loopclosure.aggregation.netvlad import unit
 from loopclosure.config import Config
 from loopclosure.errors import FitError
 from loopclosure.matching.similarity import VectorMap
+from loopclosure.matching.standard import StandardScores
 from loopclosure.methods.base import Method
 
 Describe = Callable[[Sequence[np.ndarray]], Iterable[np.ndarray]]
@@ -35,7 +36,8 @@ class Code(Protocol):
 class VectorMethod(Method):
     """Compare images by the cosine of one vector each, from which the running mean of the traverse is taken out.
 
-    The detector fits such a method even where no code is learned: it needs the mean of the first frames.
+    The score of a loop is in standard deviations of the cosines of a frame, see `StandardScores`. The detector fits
+    such a method even where no code is learned: it needs the mean of the first frames.
 
     Parameters
     ----------
@@ -53,6 +55,7 @@ class VectorMethod(Method):
 
     fitted = False
     centred = True
+    sums = StandardScores
 
     def __init__(
         self,

@@ -105,7 +105,7 @@ def explain_run(
         left = explainer.look(_frame(queries, pair.query), means[0][pair.query])
         right = explainer.look(_frame(references or queries, pair.match), means[1][pair.match])
         names = (f"query {pair.query}", f"match {pair.match}")
-        said = f"Score of the sequence {pair.score:.3f}, {'accepted' if pair.accepted else 'not accepted'}. "
+        said = f"Score {pair.score:.3f}, {'accepted' if pair.accepted else 'not accepted'}. "
         plates += _draw(Path(out), explainer, (left, right), names, said, f"{pair.query:06}_{pair.match:06}")
         report("heat maps", number + 1, len(pairs))
     centred = "The running mean of the drive is taken out" if detector.config.aggregation.centre_window else _NO_MEAN
@@ -158,10 +158,11 @@ _NO_MEAN = "No mean is taken out"
 
 
 def _learned_on(pixels: list[np.ndarray], detector: LoopDetector) -> LoopDetector:
-    """Fit on one or two images, which hold few local vectors."""
+    """Fit on one or two images, which hold few local vectors, and too few descriptors to whiten any."""
     positions = sum(maps[..., 0].size for maps in detector.method.features(pixels))
     clusters = min(detector.config.aggregation.clusters, max(1, positions // _POSITIONS_A_CLUSTER))
-    detector = LoopDetector(detector.config.with_settings({"aggregation.clusters": clusters}))
+    settings = {"aggregation.clusters": clusters, "aggregation.components": 0}
+    detector = LoopDetector(detector.config.with_settings(settings))
     try:
         detector.fit(pixels, source="images shown")
     except FitError as error:
@@ -259,8 +260,9 @@ def _plate(out: Path, file: str, title: str, text: str, figure: Figure) -> _Plat
 
 def _write(out: Path, title: str, detector: LoopDetector, plates: list[_Plate], centred: str) -> Explanation:
     arrays, spectrum = detector.method.to_arrays(), None
-    if "kl.energies" in arrays:
-        figure = kl_spectrum(arrays["kl.energies"], kept=len(arrays["kl.basis"]))
+    learned = next((stage for stage in ("kl", "reduction") if f"{stage}.energies" in arrays), None)
+    if learned is not None:
+        figure = kl_spectrum(arrays[f"{learned}.energies"], kept=len(arrays[f"{learned}.basis"]))
         spectrum = _plate(out, "spectrum.png", "KL spectrum", "", figure)
     text = resources.files(__package__).joinpath(PAGE).read_text(encoding="utf-8")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from loopclosure.config import Config
+from loopclosure.evaluation.compare import milliseconds_a_frame
 from loopclosure.records import Decision, Reason
 from loopclosure.report.pairs import Pair
 from loopclosure.runs import Run
+from loopclosure.weights.table import RANDOM_NAME
 
 REASONS = {
     Reason.ACCEPTED: "the best candidate passed",
@@ -68,11 +70,11 @@ def key_numbers(run: Run, loops: Sequence[Pair], metrics: Mapping[str, Any] | No
     """Return the numbers of the head of the page."""
     references = run.info["references"]
     note = "in one stream" if references is None else f"against {references}"
-    time = milliseconds_a_frame(run)
+    time = milliseconds_a_frame(run.info, map_was_saved=run.reference_images is None)
     numbers = [
         Number(str(len(run.decisions)), "frames", note),
         Number(str(len(loops)), "accepted loops"),
-        Number("n/a" if time is None else f"{time:.1f}", "ms a frame", "features, descriptor, search"),
+        Number(f"{time:.1f}", "ms a frame", "features, descriptor, search"),
     ]
     if metrics is not None:
         low_high = metrics["recall_at_100_precision_interval"]
@@ -83,17 +85,6 @@ def key_numbers(run: Run, loops: Sequence[Pair], metrics: Mapping[str, Any] | No
             Number(percent(metrics["recall_at_100_precision"]), "recall at 100 % precision", interval),
         ]
     return numbers
-
-
-def milliseconds_a_frame(run: Run) -> float | None:
-    """Return the time of the stages that every frame passes, without reading and learning; None if unknown."""
-    seconds, frames = run.info["seconds"], len(run.decisions)
-    against_images = run.reference_images is not None and run.reference_images is not run.query_images
-    described = frames + (run.info["references"] if against_images else 0)
-    try:
-        return 1000 * (seconds["features"] / described + (seconds["describe"] + seconds["match"]) / frames)
-    except (KeyError, ZeroDivisionError):
-        return None
 
 
 def measured(metrics: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -147,7 +138,7 @@ def _setting(value: Any) -> str:
 
 def random_weights(info: Mapping[str, Any]) -> bool:
     """Whether the network was never trained."""
-    return str(info["weights"].get("weights", "")).startswith("random")
+    return info["weights"].get("weights") == RANDOM_NAME
 
 
 def provenance(info: Mapping[str, Any]) -> list[tuple[str, str]]:

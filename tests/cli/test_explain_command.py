@@ -64,7 +64,16 @@ def test_a_run(call, run, tmp_path):
 
 def test_json_lists_the_pictures(call, lap, tmp_path):
     code, text, _ = call(
-        lap / "0.png", lap / "1.png", "--out", tmp_path, "--json", *FAST, "--set", "features.width=256"
+        lap / "0.png",
+        lap / "1.png",
+        "--out",
+        tmp_path,
+        "--json",
+        *FAST,
+        "--set",
+        "features.width=256",
+        "--gamma",
+        "0.6",
     )
     assert code == 0
     found = json.loads(text)

@@ -21,7 +21,9 @@ from loopclosure.training.network import freeze, open_backbone
 @pytest.fixture(scope="module")
 def settings(small):
     """A learning rate at which two epochs tell."""
-    return small.with_settings({"training.learning_rate": 0.001, "training.held_out": 0.25, "training.margin": 3.0})
+    return small.with_settings(
+        {"compression.gamma": 0.6, "training.learning_rate": 0.001, "training.held_out": 0.25, "training.margin": 3.0}
+    )
 
 
 def task_of(drive, config, until="conv3"):

@@ -179,7 +179,7 @@ def test_an_overlay_is_brighter_where_it_is_hot():
 
 def numbers_of(page):
     """Score of the sequence and of the frames alone, of each pair of a page."""
-    found = re.findall(r"Score (-?[\d.]+), [\w ]+\. Score of the two frames alone (-?[\d.]+),", page)
+    found = re.findall(r"Score (-?[\d.]+), [\w ]+\. The two frames alone, unwhitened: (-?[\d.]+),", page)
     return np.array(found, float).reshape(-1, 2)
 
 

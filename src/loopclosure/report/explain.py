@@ -238,7 +238,7 @@ def _draw(
         pairs = matches(first, last)
         title = " and ".join(names)
         alike = cosine(first, last)
-        text = f"{said}Score of the two frames alone {(1 + alike) / 2:.3f}, from a cosine of {alike:.3f}."
+        text = f"{said}The two frames alone, unwhitened: {(1 + alike) / 2:.3f}, from a cosine of {alike:.3f}."
     plates = [_plate(out, f"heat_{suffix}.png", title, text, draw_heat(views, heats, names, pairs))]
     if len(views) > 1:
         plates.append(_plate(out, f"geometry_{suffix}.png", "", "", _geometry(first.image, last.image, names)))

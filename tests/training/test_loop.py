@@ -47,10 +47,20 @@ class Line:
         return {"loss": abs(float(self.parameters["slope"].detach()) - 2)}
 
 
+def sgd(task, training):
+    decay = training.weight_decay
+    return torch.optim.SGD(task.parameters.values(), lr=0.05, momentum=training.momentum, weight_decay=decay)
+
+
+def adamw(task, training):
+    return torch.optim.AdamW(task.parameters.values(), lr=0.05, weight_decay=training.weight_decay)
+
+
 def trained(folder, task=None, **more):
     task = task or Line()
-    settings = {"epochs": 4, "patience": 0, **more.pop("settings", {})}
-    run = run_training(task, folder, Training(**settings), learning_rate=0.05, made_from={"seed": 7}, **more)
+    training = Training(**{"epochs": 4, "patience": 0, **more.pop("settings", {})})
+    optimizer = more.pop("optimizer", sgd)(task, training)
+    run = run_training(task, folder, training, optimizer=optimizer, made_from={"seed": 7}, **more)
     return run, {name: float(value.detach()) for name, value in task.parameters.items()}
 
 
@@ -76,11 +86,12 @@ def test_it_learns(tmp_path):
 
 
 @pytest.mark.parametrize("step", [1, 3, 4, 7, 11, 17, 24])
-def test_interrupted_anywhere_and_resumed_is_the_same(tmp_path, step):
-    whole, values = trained(tmp_path / "whole")
+@pytest.mark.parametrize("optimizer", [sgd, adamw])
+def test_interrupted_anywhere_and_resumed_is_the_same(tmp_path, step, optimizer):
+    whole, values = trained(tmp_path / "whole", optimizer=optimizer)
     with pytest.raises(StoppedError):
-        trained(tmp_path / "cut", progress=stop_at(step))
-    resumed, same_values = trained(tmp_path / "cut", resume=True)
+        trained(tmp_path / "cut", progress=stop_at(step), optimizer=optimizer)
+    resumed, same_values = trained(tmp_path / "cut", resume=True, optimizer=optimizer)
     assert resumed == whole
     assert same_values == values
 
@@ -162,8 +173,9 @@ def test_what_cannot_be_resumed(tmp_path):
     trained(tmp_path)
     with pytest.raises(ModelError, match="was begun"):
         trained(tmp_path)
+    task, training = Line(), Training()
     with pytest.raises(ModelError, match="made with seed = 7, here it is 8"):
-        run_training(Line(), tmp_path, Training(), learning_rate=0.05, made_from={"seed": 8}, resume=True)
+        run_training(task, tmp_path, training, optimizer=sgd(task, training), made_from={"seed": 8}, resume=True)
 
 
 @pytest.mark.parametrize("damage", ["cut", "bits", "text"])

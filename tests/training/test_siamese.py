@@ -21,10 +21,10 @@ from loopclosure.training.augment import Augmentation
 from loopclosure.training.card import CARD
 from loopclosure.training.checkpoint import CHECKPOINT
 from loopclosure.training.data import open_data
-from loopclosure.training.network import freeze, open_backbone
+from loopclosure.training.network import freeze, maps_of, open_backbone
 from loopclosure.training.siamese import PairBatch, SiameseTask, _vectors, describe_images, train_siamese
 
-LONGER = {"training.epochs": 3, "training.learning_rate": 0.05, "training.seed": 1}
+LONGER = {"training.epochs": 3, "training.learning_rate": 5e-4, "training.seed": 1}
 
 KILLED = """
 import json, os, signal, sys
@@ -185,6 +185,22 @@ def test_the_gradient_of_one_weight_comes_from_both_branches(class_tree, small):
         parts.append(weight.grad.clone())
     assert torch.allclose(both, parts[0] + parts[1], atol=1e-6)
     assert not torch.allclose(both, 2 * parts[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("until", ["nothing", "conv1", "conv3"])
+def test_frozen_layers_by_a_few_images_give_the_maps_and_gradients_of_the_whole_chain(small, until):
+    chain = open_backbone(small).module
+    freeze(chain, until)
+    inputs = torch.randn(7, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    learned = [value for value in chain.parameters() if value.requires_grad]
+    (whole,), maps = chain(inputs), maps_of(chain, inputs)
+    assert torch.allclose(maps, whole, rtol=1e-4, atol=1e-4 * float(whole.detach().abs().max()))
+    if not learned:
+        assert not maps.requires_grad
+        return
+    wanted, found = (torch.autograd.grad(values.square().mean(), learned) for values in (whole, maps))
+    for one, other in zip(wanted, found, strict=True):
+        assert torch.allclose(one, other, rtol=1e-3, atol=1e-4 * float(one.abs().max()))
 
 
 def test_training_learns_the_classes(class_tree, small, tmp_path):

@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 
 from loopclosure.errors import ModelError
 
-FORMAT = 1
+FORMAT = 2
 CHECKPOINT, BEFORE = "checkpoint.safetensors", "checkpoint.before.safetensors"
 MAX_BYTES = 8 << 30
 

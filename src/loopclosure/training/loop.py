@@ -107,7 +107,7 @@ def run_training(
     folder: Path,
     training: Training,
     *,
-    learning_rate: float,
+    optimizer: torch.optim.Optimizer,
     made_from: Mapping[str, Any],
     resume: bool = False,
     progress: Progress | None = None,
@@ -121,8 +121,8 @@ def run_training(
         For checkpoints and the TensorBoard log.
     training : Training
         Epochs, schedule, early stop.
-    learning_rate : float
-        Of the first epochs.
+    optimizer : torch.optim.Optimizer
+        Of the parameters of `task`, in their order, with the learning rate of the first epochs.
     made_from : mapping
         Everything that decides the numbers; a checkpoint made from anything else is refused.
     resume : bool
@@ -138,10 +138,7 @@ def run_training(
         If there is a checkpoint and `resume` is false, or there is none, or it is damaged or of another training.
     """
     expect(folder, resume=resume)
-    parameters = task.parameters
-    optimizer = torch.optim.SGD(
-        parameters.values(), lr=learning_rate, momentum=training.momentum, weight_decay=training.weight_decay
-    )
+    parameters, learning_rate = task.parameters, optimizer.defaults["lr"]
     if resume:
         run, best = _resumed(folder, parameters, optimizer, made_from)
     else:
@@ -250,10 +247,8 @@ def _save(
 ) -> None:
     tensors = {f"now.{name}": value for name, value in parameters.items()}
     tensors |= {f"best.{name}": value for name, value in best.items()}
-    for name, value in parameters.items():
-        momentum = optimizer.state[value].get("momentum_buffer")
-        if momentum is not None:
-            tensors[f"momentum.{name}"] = momentum
+    for number, state in optimizer.state_dict()["state"].items():
+        tensors |= {f"optimizer.{number}.{key}": value for key, value in state.items() if value is not None}
     save_checkpoint(folder, {"run": asdict(run), "made_from": dict(made_from)}, tensors)
 
 
@@ -270,9 +265,12 @@ def _resumed(
             "resume with the same, or begin in another folder"
         )
     _put_back(parameters, {name: tensors[f"now.{name}"] for name in parameters})
-    for name, value in parameters.items():
-        if f"momentum.{name}" in tensors:
-            optimizer.state[value]["momentum_buffer"] = tensors[f"momentum.{name}"].to(value.device)
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for name in tensors:
+        if name.startswith("optimizer."):
+            _, number, key = name.split(".")
+            state.setdefault(int(number), {})[key] = tensors[name]
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
     best = {name: tensors[f"best.{name}"].to(value.device) for name, value in parameters.items()}
     return Run(**header["run"]), best
 

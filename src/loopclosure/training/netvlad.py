@@ -19,7 +19,7 @@ from loopclosure.aggregation.reduction import Reduction
 from loopclosure.compression import ChannelKL
 from loopclosure.config import Config
 from loopclosure.errors import ConfigError, FitError
-from loopclosure.features.backbones import Backbone
+from loopclosure.features.backbones import Backbone, TapChain
 from loopclosure.images.ahead import in_batches, read_ahead
 from loopclosure.images.decode import Image
 from loopclosure.training.augment import Augmentation
@@ -29,7 +29,7 @@ from loopclosure.training.data import Images, TrainingData, open_data
 from loopclosure.training.loop import Measures, Progress, run_training
 from loopclosure.training.losses import TripletRankingLoss, hardest_triplets
 from loopclosure.training.measures import place_measures
-from loopclosure.training.network import TOGETHER, autocast, freeze, inputs_of, open_backbone, save_backbone
+from loopclosure.training.network import TOGETHER, autocast, freeze, inputs_of, maps_of, open_backbone, save_backbone
 from loopclosure.training.places import DIFFERENT, SAME, UNKNOWN, PosedPlaces
 
 LEARNING_RATE, MARGIN = 1e-4, 0.1
@@ -101,7 +101,12 @@ def train_netvlad(
         task,
         folder,
         training,
-        learning_rate=training.learning_rate or LEARNING_RATE,
+        optimizer=torch.optim.SGD(
+            task.parameters.values(),
+            lr=training.learning_rate or LEARNING_RATE,
+            momentum=training.momentum,
+            weight_decay=training.weight_decay,
+        ),
         made_from=made_from(config, backbone, data.summary),
         resume=resume,
         progress=progress,
@@ -127,7 +132,7 @@ class Describer(nn.Module):  # type: ignore[misc]
         Where the layer starts.
     """
 
-    def __init__(self, chain: nn.Module, kl: ChannelKL | None, fitted: NetVLAD) -> None:
+    def __init__(self, chain: TapChain, kl: ChannelKL | None, fitted: NetVLAD) -> None:
         super().__init__()
         self.chain = chain
         self.layer = NetVLADLayer(fitted)
@@ -143,7 +148,7 @@ class Describer(nn.Module):  # type: ignore[misc]
 
     def codes(self, inputs: torch.Tensor) -> torch.Tensor:
         """Return what the KL transform makes of the maps of a network input, float (n, D, h, w)."""
-        (maps,) = self.chain(inputs)
+        maps = maps_of(self.chain, inputs)
         return maps.float() if self.matrix is None else nn.functional.conv2d(maps.float(), self.matrix, self.offset)
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import torch
 from safetensors.torch import save_file
@@ -21,6 +22,7 @@ from loopclosure.weights import Progress, locate, weights_for
 NOTHING = "nothing"
 TOGETHER = 32
 """Images that go through the network at once where nothing is learned."""
+_FEW = 4  # images whose early maps stay in a processor's cache; 32 at once take four times as long
 
 
 def open_backbone(config: Config, *, progress: Progress | None = None) -> Backbone:
@@ -90,6 +92,27 @@ def inputs_of(backbone: Backbone, images: Sequence[Image]) -> torch.Tensor:
     """Return the input of ``backbone.module``, float32 (n, 3, height, width), on its device."""
     batch = torch.from_numpy(backbone.preprocessing.batch(images))
     return batch.to(backbone.device, memory_format=torch.channels_last)
+
+
+def maps_of(chain: TapChain, inputs: torch.Tensor) -> torch.Tensor:
+    """Return the map of the last layer, float (n, c, h, w).
+
+    On a CPU the layers before the first that learns see a few images at a time; so do all where no gradient is wanted.
+
+    Parameters
+    ----------
+    chain : TapChain
+        With one tap.
+    inputs : Tensor of float32, shape (n, 3, height, width)
+    """
+    parts = list(chain.parts.values())
+    learning = (torch.is_grad_enabled() and any(p.requires_grad for p in part.parameters()) for part in parts)
+    frozen = next((place for place, learns in enumerate(learning) if learns), len(parts))
+    before, behind = nn.Sequential(*parts[:frozen]), nn.Sequential(*parts[frozen:])
+    together = _FEW if inputs.device.type == "cpu" else len(inputs)
+    with torch.no_grad():
+        maps = torch.cat([before(some) for some in inputs.split(together)])
+    return cast(torch.Tensor, behind(maps))
 
 
 def save_backbone(backbone: Backbone, path: Path) -> None:

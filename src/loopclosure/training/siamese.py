@@ -31,11 +31,12 @@ from loopclosure.training.network import (
     autocast,
     freeze,
     inputs_of,
+    maps_of,
     open_backbone,
     save_backbone,
 )
 
-LEARNING_RATE, MARGIN = 0.02, 1.0
+LEARNING_RATE, MARGIN = 3e-4, 1.0
 _MOST_HELD_OUT = 1000  # images; their similarities are one matrix
 _HELD_OUT_PAIRS = 1000
 
@@ -111,7 +112,9 @@ def train_siamese(
         task,
         folder,
         training,
-        learning_rate=training.learning_rate or LEARNING_RATE,
+        optimizer=torch.optim.AdamW(
+            task.parameters.values(), lr=training.learning_rate or LEARNING_RATE, weight_decay=training.weight_decay
+        ),
         made_from=made_from(config, backbone, data.summary),
         resume=resume,
         progress=progress,
@@ -211,5 +214,5 @@ def describe_images(backbone: Backbone, images: Iterable[Image], training: Train
 
 def _vectors(backbone: Backbone, images: Sequence[Image], training: Training) -> torch.Tensor:
     with autocast(training, backbone.device):
-        (maps,) = backbone.module(inputs_of(backbone, images))
+        maps = maps_of(backbone.module, inputs_of(backbone, images))
     return functional.normalize(maps.float().mean((2, 3)), dim=-1)

@@ -230,6 +230,7 @@ def describe_run(detector: LoopDetector, seconds: Mapping[str, float]) -> dict[s
         "config": detector.config.model_dump(),
         "weights": detector.method.provenance,
         "threshold": detector.threshold,
+        "calibrated": detector.method.calibrated,
         "learned_on": detector.learned_on,
         "seconds": {stage: round(value, 3) for stage, value in seconds.items()},
         "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},

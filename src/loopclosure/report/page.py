@@ -22,6 +22,7 @@ from loopclosure.report import facts
 from loopclosure.report.curves import precision_recall
 from loopclosure.report.matrices import similarity_matrix
 from loopclosure.report.pairs import Pair, judge, spread
+from loopclosure.report.reliability import reliability
 from loopclosure.report.style import MARKS, png
 from loopclosure.report.trajectory import trajectory
 from loopclosure.runs import Run, write_whole
@@ -74,6 +75,7 @@ def write_report(
     pairs = judge(run.decisions, truth, tolerance=tolerance)
     loops = [pair for pair in pairs if pair.accepted]
     matrix = similarity_matrix(run.matrix, frames=_frames(run), truth=truth, loops=loops)
+    reliable = reliability(pairs) if run.info.get("calibrated") else None
     path = trajectory(poses, loops, truth, reference_xy_m=reference_poses) if poses is not None else None
     page = _template().render(
         title=title or facts.title_of(run.info),
@@ -87,6 +89,7 @@ def write_report(
         mistakes=_cards(run, [pair for pair in pairs if pair.right is False], truth, most=_WORST),
         judged=truth is not None,
         curve=_embed(precision_recall({run.info["config"]["method"]: curve})) if curve is not None else None,
+        reliability=_embed(reliable) if reliable is not None else None,
         measured=facts.measured(metrics) if metrics is not None else [],
         protocol=facts.protocol(metrics) if metrics is not None else [],
         trajectory=_embed(path) if path is not None else None,

@@ -1,4 +1,4 @@
-"""Keypoints: unit RootSIFT, packed ORB, points in pixels of the image given, blank images."""
+"""Keypoints: unit RootSIFT at blobs and corners, packed ORB, points in pixels of the image given, blank images."""
 
 from __future__ import annotations
 
@@ -72,10 +72,49 @@ def test_root_sift_is_the_root_of_shares() -> None:
     assert not root_sift(np.zeros((2, 128), np.float32)).any()
 
 
-def test_strongest_features_come_first() -> None:
-    all_of_them = KeypointExtractor(max_features=200)(street())
-    few = KeypointExtractor(max_features=20)(street())
+@pytest.mark.parametrize("kind", ["rootsift", "corners"])
+def test_strongest_features_come_first(kind: str) -> None:
+    all_of_them = KeypointExtractor(kind, max_features=200)(street())
+    few = KeypointExtractor(kind, max_features=20)(street())
     np.testing.assert_array_equal(few.points, all_of_them.points[:20])
+
+
+@pytest.mark.parametrize("most", [7, 100, 5000])
+def test_corners_are_those_of_shi_and_tomasi(most: int) -> None:
+    grey = cv2.cvtColor(street(), cv2.COLOR_RGB2GRAY)
+    points = KeypointExtractor("corners", max_features=most, side=320)(street()).points
+    wanted = cv2.goodFeaturesToTrack(grey, maxCorners=most, qualityLevel=0.001, minDistance=6)[:, 0]
+    np.testing.assert_array_equal(points, wanted)
+    assert len(points) == most if most <= 100 else 100 < len(points) < 5000
+    response = cv2.cornerMinEigenVal(grey, 3)
+    strengths = [response[int(row), int(column)] for column, row in points]
+    assert strengths == sorted(strengths, reverse=True)
+    distances = np.linalg.norm(points[:, None] - points, axis=2)
+    assert distances[~np.eye(len(points), dtype=bool)].min() >= 6
+
+
+def test_corners_are_described_upright_and_in_one_size() -> None:
+    grey = cv2.cvtColor(street(), cv2.COLOR_RGB2GRAY)
+    found = KeypointExtractor("corners", max_features=60, side=320)(street())
+    np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1e-5)
+    for point, descriptor in zip(found.points.tolist(), found.descriptors, strict=True):
+        _, ((*raw,),) = cv2.SIFT_create().compute(grey, [cv2.KeyPoint(*point, size=3.2, angle=0)])
+        np.testing.assert_allclose(descriptor, [(value / sum(raw)) ** 0.5 for value in raw], atol=1e-5)
+
+
+def test_corners_of_a_view_that_moved_are_found_again_as_they_were() -> None:
+    image = street(size=(240, 420))
+    extractor = KeypointExtractor("corners", max_features=5000, side=400)
+    left, right = extractor(image[:, :400]), extractor(image[:, 20:])
+    before = {tuple(point): row for point, row in zip(left.points.tolist(), left.descriptors, strict=True)}
+    inside = [
+        (before.get((column + 20, row)), descriptor)
+        for (column, row), descriptor in zip(right.points.tolist(), right.descriptors, strict=True)
+        if 30 < column < 350 and 30 < row < 210
+    ]
+    same = [np.abs(one - other).max() < 0.02 for one, other in inside if one is not None]
+    assert len(same) > 0.95 * len(inside) > 50
+    assert np.mean(same) > 0.95
 
 
 def test_wrong_input_is_named() -> None:

@@ -1,7 +1,8 @@
-"""Images to local descriptors: RootSIFT and ORB."""
+"""Images to local descriptors: RootSIFT at blobs or at corners, and ORB."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,9 +11,12 @@ import numpy as np
 
 from loopclosure.errors import ConfigError, ImageError
 
-KeypointKind = Literal["rootsift", "orb"]
-DESCRIPTOR_SIZES: dict[str, int] = {"rootsift": 128, "orb": 32}
-"""Columns of the descriptors of each kind: float32 for ``rootsift``, packed bits (uint8) for ``orb``."""
+KeypointKind = Literal["rootsift", "corners", "orb"]
+DESCRIPTOR_SIZES: dict[str, int] = {"rootsift": 128, "corners": 128, "orb": 32}
+"""Columns of the descriptors of each kind: float32 for RootSIFT, packed bits (uint8) for ``orb``."""
+
+_CORNER_QUALITY, _CORNER_DISTANCE = 0.001, 6  # least share of the best corner's response; pixels between two corners
+_CORNER_SIZE = 3.2  # pixels: the finest layer of SIFT's pyramid that needs no enlarged image
 
 
 @dataclass(frozen=True)
@@ -24,7 +28,7 @@ class Keypoints:
     points : ndarray (n, 2) float32
         Column and row in pixels of the image that was given, centre of the first pixel at (0, 0).
     descriptors : ndarray (n, 128) float32 or (n, 32) uint8
-        Unit rows for RootSIFT, 256 packed bits for ORB.
+        Unit rows of RootSIFT, 256 packed bits for ORB.
     """
 
     points: np.ndarray
@@ -41,9 +45,11 @@ class KeypointExtractor:
 
     Parameters
     ----------
-    kind : {"rootsift", "orb"}
+    kind : {"rootsift", "corners", "orb"}
         SIFT (Lowe 2004) whose descriptors are L1-normalised and rooted (Arandjelovic & Zisserman 2012, Sec. 3),
-        so that the Euclidean distance compares them by the Hellinger kernel; or ORB (Rublee et al. 2011).
+        so that the Euclidean distance compares them by the Hellinger kernel; the same descriptors, upright and of one
+        size, at corners (Shi & Tomasi 1994) that keep a distance, for views that differ little in scale and roll; or
+        ORB (Rublee et al. 2011).
     max_features : int
         At most so many features an image.
     side : int
@@ -77,9 +83,9 @@ class KeypointExtractor:
         self.max_features = max_features
         self.side = side
         self._detector: cv2.Feature2D = (
-            cv2.SIFT.create(nfeatures=max_features, contrastThreshold=contrast_threshold)
-            if kind == "rootsift"
-            else cv2.ORB.create(nfeatures=max_features, fastThreshold=fast_threshold)
+            cv2.ORB.create(nfeatures=max_features, fastThreshold=fast_threshold)
+            if kind == "orb"
+            else cv2.SIFT.create(nfeatures=max_features, contrastThreshold=contrast_threshold)
         )
 
     def __call__(self, image: np.ndarray) -> Keypoints:
@@ -107,7 +113,7 @@ class KeypointExtractor:
         if scale != 1:
             size = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))
             grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-        found, descriptors = self._detector.detectAndCompute(grey, None)
+        found, descriptors = self._detected(grey)
         if not found:
             dtype = np.uint8 if self.kind == "orb" else np.float32
             return Keypoints(np.zeros((0, 2), np.float32), np.zeros((0, DESCRIPTOR_SIZES[self.kind]), dtype))
@@ -119,7 +125,16 @@ class KeypointExtractor:
         # Pixel centres, not pixel corners, are whole numbers: hence the half pixels.
         return Keypoints(
             ((points + 0.5) * back - 0.5).astype(np.float32),
-            root_sift(descriptors) if self.kind == "rootsift" else descriptors,
+            descriptors if self.kind == "orb" else root_sift(descriptors),
+        )
+
+    def _detected(self, grey: np.ndarray) -> tuple[Sequence[cv2.KeyPoint], np.ndarray]:
+        if self.kind != "corners":
+            return self._detector.detectAndCompute(grey, None)
+        corners = cv2.goodFeaturesToTrack(grey, self.max_features, _CORNER_QUALITY, _CORNER_DISTANCE)
+        strongest_first = range(len(corners), 0, -1) if corners is not None else ()
+        return self._detector.compute(
+            grey, [cv2.KeyPoint(*corners[-i, 0].tolist(), _CORNER_SIZE, 0, i) for i in strongest_first]
         )
 
 

@@ -2,7 +2,7 @@
 
     local_features.py   what is kept of an image       matching.py   features to pairs of points
     geometry.py         pairs of points to a motion    verifier.py   Verifier: all of it, and the rule
-    views.py            what is kept of a drive        witness.py    several frames of a sequence together
+    views.py, pictures.py   what is kept of a drive    witness.py    several frames of a sequence together
 
 >>> from loopclosure.verification import Verifier
 >>> verifier = Verifier("strict")

@@ -1,13 +1,11 @@
-"""The local features of one frame, small enough to keep for every frame of a map."""
+"""The local features of one frame, in a byte an entry."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from loopclosure.errors import ModelError
 from loopclosure.features.keypoints import DESCRIPTOR_SIZES, Keypoints
 
 _ROOT_SIFT_STEP = 1 / 512  # entries of a RootSIFT row are rarely above a half; a byte holds them as it holds SIFT's
@@ -46,36 +44,6 @@ class LocalFeatures:
         """
         binary = self.descriptors.shape[1] == DESCRIPTOR_SIZES["orb"]
         return (np.unpackbits(self.descriptors, axis=1) if binary else self.descriptors).astype(np.float32)
-
-    def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return the state, for `loopclosure.store`."""
-        return {"points": self.points, "descriptors": self.descriptors, "size": np.array(self.size, np.int64)}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> LocalFeatures:
-        """Rebuild what `to_arrays` gave.
-
-        Raises
-        ------
-        ModelError
-            If the arrays do not belong together.
-        """
-        points, descriptors, size = (arrays[name] for name in ("points", "descriptors", "size"))
-        if (
-            points.shape != (len(descriptors), 2)
-            or points.dtype != np.float32
-            or not np.isfinite(points).all()
-            or descriptors.dtype != np.uint8
-            or descriptors.ndim != 2
-            or descriptors.shape[1] not in DESCRIPTOR_SIZES.values()
-            or size.shape != (2,)
-            or (size < 1).any()
-        ):
-            raise ModelError(
-                f"local features of {points.shape} points and {descriptors.shape} descriptors, wanted (n, 2) and "
-                "(n, 128) or (n, 32): is the file damaged?"
-            )
-        return cls(points, descriptors, (int(size[0]), int(size[1])))
 
 
 def compact(keypoints: Keypoints, size: tuple[int, int]) -> LocalFeatures:

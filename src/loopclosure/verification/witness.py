@@ -49,11 +49,11 @@ class Witness:
         """Support of a pair that is verified by itself."""
         return self._drive.verifier.least_support
 
-    def hear(self, query: int, matches: Sequence[int]) -> list[Heard]:
-        """Return what is known of each candidate of a frame, after a look at the frame if it has a view."""
+    def hear(self, query: int, matches: Sequence[int], *, look_at: Sequence[int]) -> list[Heard]:
+        """Return what is known of each candidate of a frame, after a look at some of them if the frame has a view."""
         self._seen = self._seen[self._seen[:, 0] > query - self._length]
-        if self._drive.wanted(query) and len(self._places):
-            self._look(query, matches)
+        if self._drive.wanted(query) and len(self._places) and look_at:
+            self._look(query, look_at)
         age = query - self._seen[:, 0]
         return [self._on_the_way(match - self._seen[:, 1], age) for match in matches]
 

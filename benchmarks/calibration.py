@@ -1,11 +1,12 @@
 """The odds of a loop: how they were fitted, and what they come to on places that were left out.
 
-    python benchmarks/calibration.py [--data FOLDER] [--cases 'a;b;c'] [--rows FILE.npz]
+    python benchmarks/calibration.py [--data FOLDER] [--cases 'a;b;c'] [--rows FILE.npz ...]
 
 FOLDER holds `gardens_point` and `corridor`. Every case goes through `LoopDetector` with the default settings and
 sequences of 10, 5 and 1 frames; the evidence for each candidate is labelled by the truth (right within 3 frames, wrong
-beyond 10 or where there is no loop) and a logistic model is fitted to it, every case weighing the same. Then each
-group of places is left out in turn. With `--rows` the evidence is kept in a file, and taken from there if it exists.
+beyond 10 or where there is no loop) and a logistic model is fitted to that of the longest sequences, every case
+weighing the same. Then each group of places is left out in turn. With `--rows` the evidence is kept in a file, or taken
+from files that exist: `--rows a.npz b.npz` joins the cases of two runs.
 """
 
 import argparse
@@ -24,7 +25,7 @@ from loopclosure.verification import Verifier
 
 LENGTHS = 10, 5, 1
 RIGHT, WRONG, TOLERANCE = 3, 10, 2
-BARS = 2.0, 3.0, 4.0, 5.0
+BARS = 1.0, 2.0, 3.0, 3.2, 4.0, 5.0
 PAIRS = {
     "day": ("gardens_point/day_left", "gardens_point/day_right"),
     "night": ("gardens_point/day_right", "gardens_point/night_right"),
@@ -130,9 +131,8 @@ def label(rows):
 
 def fit(rows):
     labels = label(rows)
-    kept = labels >= 0
-    case = rows[:, 0] * 100 + rows[:, 1]
-    _, inverse, counts = np.unique(case, return_inverse=True, return_counts=True)
+    kept = (labels >= 0) & (rows[:, 1] == max(LENGTHS))
+    _, inverse, counts = np.unique(rows[:, 0], return_inverse=True, return_counts=True)
     model = LogisticRegression(C=1.0, max_iter=1000)
     features = rows[:, len(COLUMNS) :]
     scale = features[kept].std(0)
@@ -161,12 +161,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--cases", default="")
-    parser.add_argument("--rows", type=Path)
+    parser.add_argument("--rows", type=Path, nargs="+", default=[])
     args = parser.parse_args()
     names, groups, rows = [], [], []
-    if args.rows and args.rows.exists():
-        kept = np.load(args.rows)
-        names, groups, rows = kept["names"].tolist(), kept["groups"].tolist(), kept["rows"]
+    if args.rows and args.rows[0].exists():
+        names, groups, rows = taken_from(args.rows)
     else:
         network = LoopDetector().method.features
         for name, (group, images_of) in cases(args.data).items():
@@ -181,8 +180,18 @@ def main():
                 rows += evidence(len(names) - 1, name, reference, images, true, length, maps, local)
         rows = np.array(rows, np.float64)
         if args.rows:
-            np.savez(args.rows, names=names, groups=groups, rows=rows)
+            np.savez(args.rows[0], names=names, groups=groups, rows=rows)
     report(names, np.array(groups), rows)
+
+
+def taken_from(files):
+    names, groups, rows = [], [], []
+    for file in files:
+        kept = np.load(file)
+        rows.append(kept["rows"] + np.eye(1, kept["rows"].shape[1]) * len(names))
+        names += kept["names"].tolist()
+        groups += kept["groups"].tolist()
+    return names, groups, np.concatenate(rows)
 
 
 def report(names, groups, rows):

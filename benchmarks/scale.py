@@ -1,6 +1,7 @@
 """A map of up to a million places: time of a query and of an `add`, recall, memory.
 
     python benchmarks/scale.py [--places 1000000] [--streets 8] [--picture docs/images/scale.png] [--first-looks]
+    python benchmarks/scale.py --detector [--places 200000] [--streets 8]
 
 Where the descriptors come from: simulated streets, each driven twice, go through the embedded network, KL compression,
 NetVLAD and the whitening KL transform behind it (64 numbers). Every further street is made of two of these, mixed 0.85
@@ -29,6 +30,7 @@ from loopclosure.aggregation.centring import centre_traverse
 from loopclosure.aggregation.netvlad import unit
 from loopclosure.aggregation.reduction import Reduction
 from loopclosure.config import Config
+from loopclosure.detect import LoopDetector
 from loopclosure.evaluation.machine import describe_machine
 from loopclosure.images.simulator import Drive, SimulationSettings
 from loopclosure.matching.index import PlaceIndex
@@ -102,13 +104,13 @@ def recall_and_times(places, queries):
 
 def sequences(places, laps, number):
     """Median seconds of a sequence search on the second lap of a street, and how often its best is the best of all."""
-    search, everything, times, same = SequenceSearch(places, LENGTH), SequenceScores(LENGTH), [], []
-    for row in street(laps, number, lap=1):
-        took, (ids, scores) = seconds(search.push, row)
+    search, everything, times, same = SequenceSearch(places, SequenceScores(LENGTH)), SequenceScores(LENGTH), [], []
+    for frame, row in enumerate(street(laps, number, lap=1), start=1):
+        took, found = seconds(search.push, row)
         wanted = everything.push(places.similarities(row))
-        if ids.size:
+        if frame >= LENGTH:
             times.append(took)
-            same.append(ids[np.argmax(scores)] == np.nanargmax(wanted))
+            same.append(np.nanargmax(found.row()) == np.nanargmax(wanted))
     return np.median(times), np.mean(same)
 
 
@@ -175,6 +177,48 @@ def first_looks(laps, count):
         print(f"| {name} | {1e3 * np.median([took for took, _ in found]):.2f} | {recall:.3f} |")
 
 
+def detector_of(rows, flat_up_to):
+    """A detector without network and verification; the colour of an image is the number of its row."""
+    settings = {"verification.mode": "none", "matching.flat_up_to": flat_up_to}
+    detector = LoopDetector(Config().with_settings(settings))
+    method = detector.method
+    method.fitted, method.centred = True, False
+    method.features = lambda images: [rows[image[0, 0] @ np.array([1, 256, 65536])] for image in images]
+    method.describe = lambda features: features[-1]
+    return detector
+
+
+def images_of(numbers):
+    return [np.broadcast_to(np.array([number], "<u4").view(np.uint8)[:3], (16, 16, 3)) for number in numbers]
+
+
+def through_the_detector(laps, sizes):
+    """Yield, for each size, what `LoopDetector.add` takes and finds on second laps, against a map of first laps."""
+    for size in sizes:
+        driven = [size // LAP * i // 5 for i in range(1, 5)]
+        laps_of = [(number, 0) for number in range(size // LAP)] + [(number, 1) for number in driven]
+        rows = np.concatenate([street(laps, number, lap=lap) for number, lap in laps_of])
+        places = np.concatenate([number * LAP + np.arange(LAP) for number in driven])
+        times, matches, accepted = [], [], []
+        for flat_up_to in (Config().matching.flat_up_to, size):
+            detector = detector_of(rows, flat_up_to)
+            detector.set_reference(images_of(range(size)))
+            results = [seconds(detector.add, image) for image in images_of(range(size, len(rows)))]
+            times.append(1e3 * np.median([took for took, _ in results[LENGTH:]]))
+            matches.append(np.array([decision.match for _, decision in results[LENGTH:]]))
+            accepted.append(np.array([decision.accepted for _, decision in results[LENGTH:]]))
+        right = abs(matches[0] - places[LENGTH:]) <= 3
+        yield {
+            "places": size,
+            "add_ms": times[0],
+            "add_all_ms": times[1],
+            "same_match": np.mean(matches[0] == matches[1]),
+            "same_accepted": np.mean(accepted[0] == accepted[1]),
+            "accepted": np.mean(accepted[0]),
+            "right": np.mean(right[accepted[0]]),
+        }
+
+
 def draw(rows, path):
     figure = new_figure(9, 3.6, gap=0.06)
     time_axes, memory_axes = figure.subplots(1, 2)
@@ -200,6 +244,7 @@ def main():
     parser.add_argument("--streets", type=int, default=8, help="streets that are simulated, 400 frames each")
     parser.add_argument("--laps", help=".npy of their descriptors: read where it exists, written where it does not")
     parser.add_argument("--picture", help="write the curves there")
+    parser.add_argument("--detector", action="store_true", help="measure LoopDetector.add against maps of these sizes")
     parser.add_argument("--first-looks", action="store_true", help="only compare ways to find 1,000 survivors")
     args = parser.parse_args()
     if args.laps and os.path.exists(args.laps):
@@ -216,11 +261,14 @@ def main():
         return
     rows = []
     most = max(args.places // LAP, 1) * LAP
-    for row in grow(laps, sorted({size for size in SIZES if size < most} | {most})):
+    sizes = sorted({size for size in SIZES if size < most} | {most})
+    for row in through_the_detector(laps, sizes) if args.detector else grow(laps, sizes):
+        if not args.detector:
+            row["ratio"] = row["query_ms"] / (rows or [row])[0]["query_ms"]
         if not rows:
-            print("| " + " | ".join([*row, "ratio"]) + " |\n" + "|---" * (len(row) + 1) + "|")
+            print("| " + " | ".join(row) + " |\n" + "|---" * len(row) + "|")
         rows.append(row)
-        figures = [*row.values(), row["query_ms"] / rows[0]["query_ms"]]
+        figures = row.values()
         print("| " + " | ".join(f"{figure:,.7g}" if figure >= 1e4 else f"{figure:.3g}" for figure in figures) + " |")
     if args.picture:
         draw(rows, args.picture)

@@ -52,7 +52,7 @@ def test_the_command(drive: Path) -> None:
     found = CliRunner().invoke(app, [*arguments, "--json"])
     assert found.exit_code == 0, found.output
     result = json.loads(found.stdout)
-    stages = ["decode", "resize", "backbone", "kl", "netvlad", "reduce", "search in 1000", "keypoints", "decide"]
+    stages = ["decode", "resize", "backbone", "kl", "netvlad", "reduce", "search in 1000", "picture", "decide"]
     assert list(result["stages_ms"]) == stages
     assert min(result["stages_ms"].values()) > 0
     assert set(result["times_faster_than_eager"]) == {"throughput", "latency"}

@@ -118,6 +118,17 @@ class Sequence(Section):
     direction: Literal["forward", "both"] = Field("forward", description="'both' also finds a street driven back")
 
 
+class Matching(Section):
+    """A frame against the map."""
+
+    flat_up_to: int = Field(
+        50_000,
+        ge=1,
+        description="places up to which a frame is compared with all; an index finds the candidates in larger maps of "
+        "whitened descriptors",
+    )
+
+
 class SeqSlam(Section):
     """Thumbnails of the method `seqslam`."""
 
@@ -146,7 +157,7 @@ class Decide(Section):
     """From the best score to a decision."""
 
     false_loops_per_1000: float = Field(
-        0.5, gt=0, le=1000, description="false loops that are allowed in 1000 frames, where a score is a probability"
+        0.3, gt=0, le=1000, description="false loops that are allowed in 1000 frames, where a score is a probability"
     )
     threshold: float | None = Field(
         None, description="least score of a loop; none = by false_loops_per_1000, or the method's own"
@@ -163,9 +174,9 @@ class Verification(Section):
     """Whether local features confirm a loop."""
 
     mode: Literal["none", "fast", "strict"] = Field(
-        "fast", description="'strict' keeps twice the local features of 'fast' and lets less that is false pass"
+        "fast", description="'strict' takes twice the local features of 'fast' and lets less that is false pass"
     )
-    every: int = Field(3, ge=1, le=100, description="local features are kept of every so many frames")
+    every: int = Field(3, ge=1, le=100, description="a small picture is kept of every so many frames")
 
 
 class Training(Section):
@@ -173,10 +184,10 @@ class Training(Section):
 
     epochs: int = Field(15, ge=0, le=10_000, description="passes over the training images")
     batch: int = Field(16, ge=1, le=4096, description="pairs, or queries, a step")
-    learning_rate: float | None = Field(None, gt=0, description="of SGD; none = 0.02 for siamese, 1e-4 for netvlad")
+    learning_rate: float | None = Field(None, gt=0, description="none = siamese 3e-4 (AdamW), netvlad 1e-4 (SGD)")
     halve_every: int = Field(5, ge=0, description="epochs after which the learning rate is halved; 0 = never")
-    momentum: float = Field(0.9, ge=0, lt=1, description="of SGD")
-    weight_decay: float = Field(1e-3, ge=0, description="of SGD")
+    momentum: float = Field(0.9, ge=0, lt=1, description="netvlad: of SGD")
+    weight_decay: float = Field(1e-3, ge=0, description="of SGD or AdamW")
     patience: int = Field(5, ge=0, description="epochs without a better held-out measure before it stops; 0 = never")
     held_out: float = Field(0.2, gt=0, lt=1, description="share of the data that measures and is not learned from")
     freeze_until: str | None = Field(
@@ -229,6 +240,7 @@ class Config(Section):
     compression: Compression = Compression()
     aggregation: Aggregation = Aggregation()
     learning: Learning = Learning()
+    matching: Matching = Matching()
     sequence: Sequence = Sequence()
     decision: Decide = Decide()
     verification: Verification = Verification()

@@ -8,20 +8,21 @@ sequences, which must reach a threshold on frames that move on together.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from loopclosure.config import Config
 from loopclosure.matching.candidates import Candidate, best_candidates
-from loopclosure.matching.consistency import Consistency
+from loopclosure.matching.consistency import Consistency, Followed
+from loopclosure.matching.scored import Scored
 from loopclosure.methods import Method
 from loopclosure.records import Decision, Reason
 from loopclosure.store import part
-from loopclosure.verification import LocalFeatures, Verifier, Views, Witness
+from loopclosure.verification import Verifier, Views, Witness
 
-_CANDIDATES = 4  # that are looked at; the true place is among so many far more often than it is the first
+_CANDIDATES = 8  # that are looked at; the true place is among so many far more often than it is the first
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,8 @@ class Evidence:
         Standard deviations by which it lies above the best that chance would give, see `Candidate`.
     run : int
         Frames over which the candidate has moved on with the robot.
+    lasting : float
+        Mean standing in these frames, see `Followed`.
     support : float
         Geometric support in the frames of the sequence, see `Verification.support`; 0 without verification.
     inliers : int or None
@@ -48,6 +51,7 @@ class Evidence:
     similarity: float
     standing: float
     run: int
+    lasting: float = 0.0
     support: float = 0.0
     inliers: int | None = None
 
@@ -62,22 +66,29 @@ class Evidence:
         return 1 / (1 + math.exp(-self.log_odds))
 
 
-_LONGEST_RUN = 40
-_SUPPORT_BY_CHANCE = 1.0
+_LONGEST_RUN = 60
+_SURE_RUN = 10  # frames from which on geometry counts in full: the like of a lorry is soon out of sight
+_SUPPORT_BY_CHANCE, _MOST_SUPPORT = 2.0, 20.0
 # Fitted by `python benchmarks/calibration.py`, which prints them and what they come to on places that were left out.
-_WEIGHTS = 0.496, 17.277, 0.154, 2.599
-_CONSTANT = -7.032
-_FALSE_PER_1000 = 30.0  # false loops among 1000 frames that no loop is in, at even odds
+_WEIGHTS = 0.843, 0.081, 1.007, 1.373
+_CONSTANT = -6.039
+_FALSE_PER_1000 = 10.0  # false loops among 1000 frames that no loop is in, at even odds
+_WORTH_A_LOOK = -5.0  # log-odds; below, geometry would have to be surer than it ever is by itself
 
 
 def features_of(evidence: Evidence) -> tuple[float, ...]:
-    """Return the numbers that the log-odds are a weighted sum of: standing, similarity, run, support."""
+    """Return the numbers that the log-odds are a weighted sum of: standing, run, lasting, support."""
+    support = min(max(evidence.support - _SUPPORT_BY_CHANCE, 0.0), _MOST_SUPPORT)
     return (
-        min(max(evidence.standing, -1.0), 6.0),
-        evidence.similarity - 0.5,
+        _bounded(evidence.standing),
         float(min(evidence.run, _LONGEST_RUN)),
-        math.log1p(max(evidence.support - _SUPPORT_BY_CHANCE, 0.0)),
+        evidence.lasting,
+        support * min(evidence.run / _SURE_RUN, 1.0),
     )
+
+
+def _bounded(standing: float) -> float:
+    return min(max(standing, -1.0), 10.0)
 
 
 def least_probability(false_loops_per_1000: float) -> float:
@@ -86,7 +97,7 @@ def least_probability(false_loops_per_1000: float) -> float:
     Examples
     --------
     >>> round(least_probability(1.0), 3)
-    0.967
+    0.9
     """
     return 1 - min(false_loops_per_1000 / _FALSE_PER_1000, 0.5)
 
@@ -103,14 +114,14 @@ class Judge:
     one_stream : bool
         Whether candidates come from the drive itself.
     reference : Views, optional
-        Local features of the reference traverse; without it the drive's own are used.
+        Views of the reference traverse; without them nothing is verified. One stream has its own.
 
     Attributes
     ----------
     evidence : tuple of Evidence
         What spoke for each candidate of the last frame, best first.
     views : Views or None
-        Local features of the drive; None where nothing is verified.
+        Of the drive; None where nothing is verified.
     places : Views or None
         Those of the map: of the reference traverse, or the same ones.
     """
@@ -121,7 +132,7 @@ class Judge:
         self.one_stream = one_stream
         self.evidence: tuple[Evidence, ...] = ()
         self.views = new_views(config, method)
-        self.places = self.views if reference is None else reference
+        self.places = self.views if one_stream else reference
         self._consistency = Consistency(both_directions=config.sequence.direction == "both")
         self._witness: Witness | None = None
         if self.views is not None and self.places is not None:
@@ -141,33 +152,44 @@ class Judge:
             return least_probability(self.config.decision.false_loops_per_1000)
         return self.method.threshold
 
-    def see(self, query: int, local: LocalFeatures | None) -> None:
-        """Take the local features of a frame, where they are kept (`Views.wanted`)."""
+    def see(self, query: int, picture: bytes | None) -> None:
+        """Take the picture of a frame, where it is kept (`Views.wanted`)."""
         if self.views is not None and self.views.wanted(query):
-            self.views.add(local)
+            self.views.add(picture)
 
-    def decide(self, query: int, scores: np.ndarray, *, readable: bool) -> Decision:
-        """Decide on a frame by its sequence scores, float32 (n,), NaN where a place is no candidate."""
+    def decide(
+        self, query: int, scored: Scored, *, readable: bool, nearest: Callable[[int, int], int] | None = None
+    ) -> Decision:
+        """Decide on a frame by its sequence scores.
+
+        ``nearest(match, run)`` tells a candidate that has moved on for `run` frames from its neighbours.
+        """
         candidates = []
         if readable:
             count = _CANDIDATES if self.method.calibrated else 1
-            candidates = best_candidates(scores, count=count, length=self.config.sequence.length)
-        runs = self._consistency.push([candidate.match for candidate in candidates])
-        self.evidence = self._weighed(query, candidates, runs)
+            candidates = best_candidates(scored, count=count, length=self.config.sequence.length)
+        followed = self._consistency.push(
+            [candidate.match for candidate in candidates], [_bounded(candidate.standing) for candidate in candidates]
+        )
+        self.evidence = self._weighed(query, candidates, followed)
         if not self.evidence:
             return Decision(query, None, None, False, None, self._why_none(query) if readable else Reason.UNREADABLE)
-        best = self.evidence[0]
+        best, *others = self.evidence
+        if nearest is not None:
+            best = replace(best, match=nearest(best.match, best.run))
+            self.evidence = (best, *others)
         reason = self._why(best)
         score = best.probability if self.method.calibrated else best.similarity
         return Decision(query, best.match, score, reason is Reason.ACCEPTED, best.inliers, reason)
 
-    def _weighed(self, query: int, candidates: list[Candidate], runs: list[int]) -> tuple[Evidence, ...]:
+    def _weighed(self, query: int, candidates: list[Candidate], followed: list[Followed]) -> tuple[Evidence, ...]:
         found = [
-            Evidence(candidate.match, candidate.score, candidate.standing, run)
-            for candidate, run in zip(candidates, runs, strict=True)
+            Evidence(candidate.match, candidate.score, candidate.standing, behind.run, behind.lasting)
+            for candidate, behind in zip(candidates, followed, strict=True)
         ]
         if self._witness is not None:
-            heard = self._witness.hear(query, [candidate.match for candidate in candidates])
+            doubtful = [one.match for one in found if one.log_odds >= _WORTH_A_LOOK]
+            heard = self._witness.hear(query, [one.match for one in found], look_at=doubtful)
             found = [replace(one, **two._asdict()) for one, two in zip(found, heard, strict=True)]
         return tuple(sorted(found, key=lambda one: -one.log_odds)) if self.method.calibrated else tuple(found)
 
@@ -209,7 +231,7 @@ class Judge:
 
 
 def new_views(config: Config, method: Method) -> Views | None:
-    """Return an empty store of local features; None where nothing is to be verified."""
+    """Return an empty store of views; None where nothing is to be verified."""
     mode = config.verification.mode
     if mode == "none" or not method.calibrated:
         return None

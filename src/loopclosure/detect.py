@@ -18,11 +18,12 @@ from loopclosure.errors import FitError, LoopClosureError, ModelError
 from loopclosure.images.ahead import in_batches, read_ahead
 from loopclosure.images.decode import check_image
 from loopclosure.images.sequence import ImageSequence
+from loopclosure.matching.scored import Scored
 from loopclosure.methods import Method, PlaceMap, build_method
 from loopclosure.records import Decision, Reason
 from loopclosure.timing import Stopwatch
 from loopclosure.traverse import Traverse, describe, describe_traverse
-from loopclosure.verification import LocalFeatures, Verifier, Views
+from loopclosure.verification import Verifier, Views
 from loopclosure.warmup import WarmUp
 
 _MEAN = "mean_of_fit"  # beside the arrays of a method
@@ -39,10 +40,10 @@ class Frames(Protocol):
 
 
 class View(NamedTuple):
-    """What is seen in a frame: features of the method, and, of some frames, local ones; None where it is unreadable."""
+    """What is seen in a frame: features of the method, and, of some frames, a picture; None where it is unreadable."""
 
     features: np.ndarray | None
-    local: LocalFeatures | None
+    picture: bytes | None
 
 
 class LoopDetector:
@@ -68,8 +69,6 @@ class LoopDetector:
         What describes and compares images.
     frames : int
         Frames added so far.
-    scores : ndarray of float32, shape (n,)
-        Sequence score of the last frame to each frame of the map; NaN where that is no candidate.
     learned_on : list of str
         What the method was fitted on, in order.
 
@@ -98,9 +97,9 @@ class LoopDetector:
         self.config = _agreed_config(config, header, model)
         self.method: Method = build_method(self.config, progress=progress)
         self.learned_on: list[str] = []
-        self._clock = Stopwatch("features", "keypoints", "learn", "describe", "match", "decide")
+        self._clock = Stopwatch("features", "picture", "learn", "describe", "match", "decide")
         self.frames: int
-        self.scores: np.ndarray
+        self._scored: Scored
         self._traverse: Traverse
         self._mean: np.ndarray | None = None  # mean descriptor of what the method was fitted on
         if header is not None:
@@ -135,13 +134,21 @@ class LoopDetector:
         return self._judge.evidence
 
     @property
+    def scores(self) -> np.ndarray:
+        """Sequence score of the last frame to each frame of the map, float32 (n,); NaN where that is no candidate.
+
+        In a map that has outgrown ``matching.flat_up_to`` it is also NaN for frames that the index did not find.
+        """
+        return self._scored.row()
+
+    @property
     def map_size(self) -> int:
         """Frames that the map holds."""
         return len(self._traverse.places)
 
     @property
     def map_bytes(self) -> int:
-        """Bytes that the map takes: its descriptors, and the local features that loops are verified by."""
+        """Bytes that the map takes: its descriptors, and the pictures that loops are verified by."""
         views = self._judge.places
         return self._traverse.places.nbytes + (0 if views is None else views.nbytes)
 
@@ -181,18 +188,18 @@ class LoopDetector:
 
     def _step(self, view: View) -> Decision:
         features, readable = view.features, view.features is not None
-        self._judge.see(self.frames, view.local)
+        self._judge.see(self.frames, view.picture)
         if self._warm_up is not None:
             self._learn(self._warm_up, features)
         query, self.frames = self.frames, self.frames + 1
         if not self.method.fitted:
-            self.scores = np.full(query, np.nan, np.float32)
+            self._scored = Scored.nothing(query)
             return Decision(query, None, None, False, None, Reason.WARMING_UP if readable else Reason.UNREADABLE)
-        self.scores = self._traverse.step(features)
-        if not readable:
-            self.scores = np.full_like(self.scores, np.nan)
+        compared_with = self.map_size
+        scored = self._traverse.step(features)
+        self._scored = scored if readable else Scored.nothing(compared_with)
         with self._clock("decide"):
-            return self._judge.decide(query, self.scores, readable=readable)
+            return self._judge.decide(query, self._scored, readable=readable, nearest=self._traverse.nearest)
 
     def set_reference(self, images: Frames, *, progress: Progress | None = None) -> None:
         """Look for loops against another traverse, and no longer within the drive.
@@ -216,7 +223,7 @@ class LoopDetector:
             view = seen.get(index, looked)
             keep(describe(self.method, view.features, recent))
             if views is not None and views.wanted(index):
-                views.add(view.local)
+                views.add(view.picture)
             if progress:
                 progress(index + 1, len(images))
         if not described and not len(places):
@@ -243,7 +250,7 @@ class LoopDetector:
         if not self.map_size:
             raise FitError("the map is empty: add frames before it can serve as a reference")
         places = self.method.new_map(exclude_recent=0).restore(self._traverse.places.to_arrays())
-        self._against(places, self._judge.views, prior=self._traverse.mean)
+        self._against(places, self._judge.places, prior=self._traverse.mean)
 
     def fit(self, images: Frames, *, source: str, progress: Progress | None = None) -> None:
         """Fit the method on a traverse, in place of learning from the drive.
@@ -278,16 +285,16 @@ class LoopDetector:
         with self._clock("features"):
             found = iter(self.method.features(readable) if readable else ())
         return [
-            (index, View(None, None) if image is None else View(next(found), self._local(index, image)))
+            (index, View(None, None) if image is None else View(next(found), self._picture(index, image)))
             for index, image in frames
         ]
 
-    def _local(self, index: int, image: np.ndarray) -> LocalFeatures | None:
+    def _picture(self, index: int, image: np.ndarray) -> bytes | None:
         views = self._judge.views
         if views is None or not views.wanted(index):
             return None
-        with self._clock("keypoints"):
-            return views.verifier.features(image)
+        with self._clock("picture"):
+            return views.pack(image)
 
     def _look_ahead(self, frames: Iterable[tuple[int, np.ndarray | None]]) -> Iterator[tuple[int, View]]:
         """Yield what is seen in each frame: one thread decodes, one computes in batches, both ahead of the caller."""
@@ -304,7 +311,7 @@ class LoopDetector:
 
     def _start(self, traverse: Traverse, reference: Views | None = None) -> None:
         self.frames = 0
-        self.scores = np.zeros(0, np.float32)
+        self._scored = Scored.nothing(0)
         self._traverse = traverse
         self._judge = Judge(self.config, self.method, one_stream=traverse.one_stream, reference=reference)
 
@@ -400,9 +407,10 @@ class LoopDetector:
         if not header["one_stream"]:
             reference = detector.method.new_map(exclude_recent=0)
         judge = store.part(arrays, "judge")
-        views = None if header["one_stream"] else new_views(config, detector.method)
+        kept = store.part(judge, "places")
+        views = new_views(config, detector.method) if kept else None
         if views is not None:
-            views.restore(store.part(judge, "places"))
+            views.restore(kept)
         detector._start(detector._new_traverse(reference=reference).restore(state), views)
         detector._judge.restore(judge)
         detector.frames = int(header["frames"])
@@ -448,6 +456,7 @@ def _agreed_config(
         "images.",
         "learning.",
         "training.",
+        "matching.",
         "sequence.",
         "decision.",
         "verification.",

@@ -10,7 +10,12 @@ import numpy as np
 
 from loopclosure.aggregation.centring import RunningMean, centre_traverse
 from loopclosure.config import Config
-from loopclosure.methods import Method, PlaceMap
+from loopclosure.matching.index import PlaceIndex
+from loopclosure.matching.localisation import Trail
+from loopclosure.matching.scored import Scored
+from loopclosure.matching.sequences import SequenceScores
+from loopclosure.matching.shortlist import SequenceSearch
+from loopclosure.methods import Method, PlaceMap, Scores
 from loopclosure.store import part
 from loopclosure.timing import Stopwatch
 
@@ -51,26 +56,34 @@ class Traverse:
         self._clock = clock
         self._mean = RunningMean(_window(method, config, reference), prior=prior)
         self._recent: deque[np.ndarray] = deque(maxlen=method.window)
-        self._sequences = method.new_scores(exclude_recent=exclude)
+        self._sequences: Scores | SequenceSearch = method.new_scores(exclude_recent=exclude)
+        if isinstance(self.places, PlaceIndex) and isinstance(self._sequences, SequenceScores):
+            self._sequences = SequenceSearch(self.places, self._sequences)
+        self._trail: Trail | None = None
+        if isinstance(self.places, PlaceIndex):
+            both, length = config.sequence.direction == "both", config.sequence.length
+            self._trail = Trail(self.places, length=length, exclude_recent=exclude, both_directions=both)
 
-    def step(self, features: Features) -> np.ndarray:
-        """Do the method: describe, take out what recent frames share, compare, sum over the sequence, remember.
-
-        Returns
-        -------
-        ndarray of float32, shape (n,)
-            Score of each frame of the map, larger = more alike; NaN where it is no candidate.
-        """
+    def step(self, features: Features) -> Scored:
+        """Do the method: describe, take out what recent frames share, compare, sum over the sequence, remember."""
         with self._clock("describe"):
             descriptor = describe(self._method, features, self._recent)
             if self._method.centred:
                 descriptor = self._method.reduce(self._mean.centre(descriptor))
         with self._clock("match"):
-            similarities = self.places.similarities(descriptor)
-            scores = self._sequences.push(similarities)
+            if isinstance(self._sequences, SequenceSearch):
+                scored = self._sequences.push(descriptor)
+            else:
+                scored = Scored(self._sequences.push(self.places.similarities(descriptor)))
             if self.one_stream:
                 self.places.add(descriptor)
-        return scores
+            if self._trail is not None:
+                self._trail.push(descriptor)
+        return scored
+
+    def nearest(self, match: int, frames: int) -> int:
+        """Return the place around a candidate that the last `frames` fit best, if a sequence is shorter than that."""
+        return match if self._trail is None else self._trail.nearest(match, frames)
 
     @property
     def mean(self) -> np.ndarray | None:
@@ -83,6 +96,7 @@ class Traverse:
             "map": self.places.to_arrays(),
             "mean": self._mean.to_arrays(),
             "sequences": self._sequences.to_arrays(),
+            "trail": {} if self._trail is None else self._trail.to_arrays(),
             "recent": {f"{i:06}": features for i, features in enumerate(self._recent)},
         }
         return {f"{name}.{key}": array for name, arrays in parts.items() for key, array in arrays.items()}
@@ -92,6 +106,8 @@ class Traverse:
         self.places.restore(part(arrays, "map"))
         self._mean = RunningMean.from_arrays(part(arrays, "mean"))
         self._sequences.restore(part(arrays, "sequences"))
+        if self._trail is not None:
+            self._trail.restore(part(arrays, "trail"))
         self._recent.extend(features for _, features in sorted(part(arrays, "recent").items()))
         return self
 

@@ -45,12 +45,6 @@ def again(rows, *, seed=1):
     return unit(rows + np.random.default_rng(seed).normal(0, 0.08, rows.shape))
 
 
-def dense(ids, scores, size):
-    row = np.full(size, np.nan, np.float32)
-    row[ids] = scores
-    return row
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     length=st.integers(1, 6),
@@ -64,10 +58,10 @@ def test_a_small_map_is_compared_with_as_a_whole(length, exclude, both, extra, f
     rows = walk(frames, seed=seed)
     how = {"exclude_recent": exclude, "both_directions": both, "history": length + extra}
     places = PlaceIndex().restore({} if exclude else {"descriptors": walk(20, seed=seed + 1)})
-    search, reference = SequenceSearch(places, length, **how), SequenceScores(length, **how)
+    search, reference = SequenceSearch(places, SequenceScores(length, **how)), SequenceScores(length, **how)
     for row in rows:
         wanted = reference.push(places.similarities(row))
-        np.testing.assert_array_equal(dense(*search.push(row), len(places)), wanted)
+        np.testing.assert_array_equal(search.push(row).row(), wanted)
         if exclude:
             places.add(row)
 
@@ -87,21 +81,19 @@ def test_scores_of_the_shortlist_are_those_of_all_places(length, exclude, both, 
     how = {"exclude_recent": exclude, "both_directions": both, "history": length + extra}
     places = PlaceIndex(flat_up_to=FLAT).restore({"descriptors": rows})
     assert not places.exact
-    search, reference = SequenceSearch(places, length, **how), SequenceScores(length, **how)
-    forward = SequenceScores(length, exclude_recent=exclude, history=length + extra)
+    search, reference = SequenceSearch(places, SequenceScores(length, **how)), SequenceScores(length, **how)
     candidates = 0
     for row in drive:
         wanted = reference.push(places.similarities(row))
-        ids, scores = search.push(row)
-        np.testing.assert_allclose(scores, wanted[ids], atol=1e-6)
-        assert np.all(np.diff(ids) > 0)
-        usual = forward.push(places.similarities(row))
-        spread = usual[np.isfinite(usual)]
+        found = search.push(row)
+        np.testing.assert_allclose(found.scores, wanted[found.ids], atol=1e-6)
+        assert np.all(np.diff(found.ids) > 0)
+        spread = wanted[np.isfinite(wanted)]
         if spread.size:
-            assert search.usual.size >= min(spread.size, 256)
-            assert np.isin(np.round(search.usual, 5), np.round(spread, 5)).mean() > 0.9
-            assert search.usual.mean() == pytest.approx(spread.mean(), abs=0.03)
-        candidates += ids.size
+            assert found.usual.ids.size >= min(spread.size, 256)
+            np.testing.assert_allclose(found.usual.scores, wanted[found.usual.ids], atol=1e-6)
+            assert found.usual.scores.mean() == pytest.approx(spread.mean(), abs=0.03)
+        candidates += found.ids.size
         if exclude:
             places.add(row)
     assert candidates > 20 * 50
@@ -114,14 +106,14 @@ def test_the_best_place_is_the_best_of_all_places(both):
     second = again(lap[500:100:-1] if both else lap[100:500])
     how = {"exclude_recent": 30, "both_directions": both}
     places = PlaceIndex(flat_up_to=FLAT)
-    search, reference = SequenceSearch(places, 10, **how), SequenceScores(10, **how)
+    search, reference = SequenceSearch(places, SequenceScores(10, **how)), SequenceScores(10, **how)
     switched, same = 0, []
     for row in np.concatenate([lap, second]):
         wanted = reference.push(places.similarities(row))
-        ids, scores = search.push(row)
+        found = search.push(row)
         if not places.exact:
             switched += 1
-            same.append(ids[np.argmax(scores)] == np.nanargmax(wanted))
+            same.append(found.ids[np.argmax(found.scores)] == np.nanargmax(wanted))
         places.add(row)
     assert switched > 700
     assert np.mean(same) >= 0.99
@@ -131,15 +123,51 @@ def test_state_comes_back_before_and_after_the_switch():
     drive = np.concatenate([walk(600), again(walk(600))[:60]])
     how = {"exclude_recent": 20, "both_directions": True}
     for saved_at in (5, 450, 620):
-        one = SequenceSearch(PlaceIndex(flat_up_to=FLAT), 6, **how)
+        one = SequenceSearch(PlaceIndex(flat_up_to=FLAT), SequenceScores(6, **how))
         step_through(one, drive[:saved_at])
-        places = PlaceIndex(flat_up_to=FLAT).restore(one.places.to_arrays())
-        two = SequenceSearch(places, 6, **how).restore(one.to_arrays())
+        two = restored(one.places.to_arrays(), one.to_arrays(), 6, **how)
         assert one.places.exact == (saved_at < 600)
-        for mine, other in zip(step_through(one, drive[saved_at:]), step_through(two, drive[saved_at:]), strict=True):
-            np.testing.assert_array_equal(mine[0], other[0])
-            np.testing.assert_array_equal(mine[1], other[1])
-        np.testing.assert_array_equal(one.usual, two.usual)
+        pairs = zip(step_through(one, drive[saved_at:]), step_through(two, drive[saved_at:]), strict=True)
+        for mine, other in pairs:
+            assert_same(mine, other)
+
+
+def test_state_comes_back_in_the_first_frames_against_a_large_map():
+    rows, drive = walk(900), again(walk(900)[300:340])
+    one = restored({"descriptors": rows}, {}, 6)
+    for row in drive[:3]:
+        one.push(row)
+    two = restored({"descriptors": rows}, one.to_arrays(), 6)
+    for row in drive[3:]:
+        assert_same(one.push(row), two.push(row))
+
+
+@pytest.mark.parametrize("exclude", [0, 20])
+def test_state_of_plain_sums_goes_on_with_a_large_map(exclude):
+    """Saved where the whole map was compared: the sums go on until the frames of a sequence are known."""
+    rows, drive = walk(900), again(walk(900)[300:340])
+    plain, sums = VectorMap().restore({"descriptors": rows}), SequenceScores(6, exclude_recent=exclude)
+    for row in drive[:20]:
+        sums.push(plain.similarities(row))
+    search = restored(plain.to_arrays(), sums.to_arrays(), 6, exclude_recent=exclude)
+    for number, row in enumerate(drive[20:]):
+        wanted, found = sums.push(plain.similarities(row)), search.push(row)
+        assert (found.ids is None) == (number < 5)
+        there = ~np.isnan(found.row())
+        np.testing.assert_allclose(found.row()[there], wanted[there], atol=1e-6)
+        assert np.nanargmax(found.row()) == np.nanargmax(wanted) == 320 + number
+
+
+def restored(places, state, length, **how):
+    search = SequenceSearch(PlaceIndex(flat_up_to=FLAT).restore(places), SequenceScores(length, **how))
+    return search.restore(state) if state else search
+
+
+def assert_same(mine, other):
+    np.testing.assert_array_equal(mine.row(), other.row())
+    if mine.usual is not None:
+        np.testing.assert_array_equal(mine.usual.scores, other.usual.scores)
+        np.testing.assert_array_equal(mine.usual.ids, other.usual.ids)
 
 
 def step_through(search, drive):

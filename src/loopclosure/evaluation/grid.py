@@ -70,7 +70,10 @@ class Cell:
         chosen = config.decision.threshold
         accepted = np.nan_to_num(self.score, nan=-np.inf) >= (KLNetVLAD.threshold if chosen is None else chosen)
         consistency = Consistency(both_directions=config.sequence.direction == "both")
-        runs = [max(consistency.push([] if match == NONE else [match]), default=0) for match in self.match.tolist()]
+        runs = [
+            max((one.run for one in consistency.push([] if match == NONE else [match])), default=0)
+            for match in self.match.tolist()
+        ]
         accepted &= np.array(runs, dtype=int) >= config.decision.consistency
         n = len(self.match)
         return LoopLog(self.match, self.score, accepted, np.full(n, NONE), ("",) * n)

@@ -154,7 +154,7 @@ def _measure(
     whole = take_turns(tasks, rounds, each=frames, progress=lambda done: report("pipelines", done, rounds))
     stages = _stages(method, files, rounds, report) | {
         stage: round(1000 * (detector.seconds[stage] - before[stage]) / detector.frames, 3)
-        for stage in ("keypoints", "decide")
+        for stage in ("picture", "decide")
     }
     network = cast("Backbone", method.backbone)
     openvino = hasattr(network, "precision")

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from loopclosure.matching.scored import Scored
+
 _APART = 5  # frames of the map, at least, between two candidates
 _USUAL_DEVIATION = 0.125  # of the similarity of two single frames of different places, whitened descriptors
 _USUAL_WEIGHT = 20  # places that the usual mean and deviation count for
@@ -31,13 +33,13 @@ class Candidate:
     standing: float
 
 
-def best_candidates(scores: np.ndarray, *, count: int, length: int) -> list[Candidate]:
+def best_candidates(scored: Scored, *, count: int, length: int) -> list[Candidate]:
     """Return the best candidates, none within a sequence of a better one.
 
     Parameters
     ----------
-    scores : ndarray of float32, shape (n,)
-        Sequence scores of one frame, larger = more alike; NaN where a place is no candidate.
+    scored : Scored
+        Sequence scores of one frame.
     count : int
         At most so many.
     length : int
@@ -53,30 +55,28 @@ def best_candidates(scores: np.ndarray, *, count: int, length: int) -> list[Cand
     --------
     >>> scores = np.full(100, 0.5, np.float32)
     >>> scores[[20, 21, 70]] = 0.9, 0.95, 0.8
-    >>> [candidate.match for candidate in best_candidates(scores, count=2, length=10)]
+    >>> [candidate.match for candidate in best_candidates(Scored(scores), count=2, length=10)]
     [21, 70]
     """
-    left = np.where(np.isnan(scores), -np.inf, scores)
+    left = np.where(np.isnan(scored.scores), -np.inf, scored.scores)
     apart = max(length, _APART)
     found: list[Candidate] = []
     while len(found) < count and left.size and np.isfinite(best := left.max()):
-        match = int(left.argmax())
-        around = slice(max(match - apart, 0), match + apart + 1)
-        found.append(Candidate(match, float(best), _standing(scores, match, around, length)))
-        left[around] = -np.inf
+        match = scored.place(int(left.argmax()))
+        found.append(Candidate(match, float(best), _standing(float(best), *scored.others(match, apart), length)))
+        left[scored.around(match, apart)] = -np.inf
     return found
 
 
-def _standing(scores: np.ndarray, match: int, around: slice, length: int) -> float:
-    """Return the distance to the scores of other places, which are wrong ones but for a few.
+def _standing(score: float, others: np.ndarray, count: int, length: int) -> float:
+    """Return the distance to the scores of `count` other places, or a sample, which are wrong ones but for a few.
 
     Where there are few others, the usual mean and deviation of whitened descriptors step in.
     """
-    others = np.concatenate([scores[: around.start], scores[around.stop :]]).astype(np.float64)
-    others = others[~np.isnan(others)]
-    weight = len(others) + _USUAL_WEIGHT
-    mean = (others.sum() + _USUAL_WEIGHT * 0.5) / weight
+    prior = _USUAL_WEIGHT * (len(others) + 1) / (count + 1)  # as light in a sample as among all
+    weight = len(others) + prior
+    mean = (others.sum() + prior * 0.5) / weight
     usual = _USUAL_DEVIATION**2 / length
-    variance = (((others - others.mean()) ** 2).sum() if len(others) else 0.0) + _USUAL_WEIGHT * usual
-    expected_best = np.sqrt(2 * np.log1p((len(others) + 1) / length))
-    return float((scores[match] - mean) / np.sqrt(variance / weight) - expected_best)
+    variance = (((others - others.mean()) ** 2).sum() if len(others) else 0.0) + prior * usual
+    expected_best = np.sqrt(2 * np.log1p((count + 1) / length))
+    return float((score - mean) / np.sqrt(variance / weight) - expected_best)

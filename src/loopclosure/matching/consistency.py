@@ -3,14 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 _LARGEST_STEP = 3  # frames of the map that a match may move while the robot moves by one
+_MEMORY = 0.95  # what a frame of a run counts, to the frame behind it
+
+
+class Followed(NamedTuple):
+    """What lies behind a candidate.
+
+    Attributes
+    ----------
+    run : int
+        Frames over which it has moved on steadily.
+    lasting : float
+        Mean of what was said for it in each of these frames, older ones counting less; frames before the run count as
+        zero.
+    """
+
+    run: int
+    lasting: float
 
 
 class Consistency:
-    """Count the frames over which each candidate has moved on steadily.
+    """Follow candidates from frame to frame.
 
     From one frame to the next a candidate may stay or move by up to three frames, always the same way: forward, or
     backward where `both_directions` is asked. A moving thing that follows the robot, or two streets that look alike,
@@ -19,30 +37,38 @@ class Consistency:
     Examples
     --------
     >>> consistency = Consistency()
-    >>> [consistency.push(matches) for matches in ([10], [11, 70], [13, 71], [40], [], [42])]
+    >>> [[one.run for one in consistency.push(matches)] for matches in ([10], [11, 70], [13, 71], [40], [], [42])]
     [[1], [2, 1], [3, 2], [1], [], [1]]
     """
 
     def __init__(self, *, both_directions: bool = False) -> None:
-        self._both = both_directions
-        self._previous = np.zeros((0, 3), np.int64)  # match, frames forward, frames backward
+        self._signs = (1, -1) if both_directions else (1,)
+        self._matches = np.zeros(0, np.int64)
+        self._runs = np.zeros((len(self._signs), 0), np.int64)
+        self._lasting = np.zeros((len(self._signs), 0))
 
-    def push(self, matches: Sequence[int]) -> list[int]:
-        """Take the candidates of a new frame; return the length of the run of each, frames."""
-        current = np.ones((len(matches), 3), np.int64)
-        current[:, 0] = matches
-        steps = current[:, :1] - self._previous[:, 0]
-        for column, sign in ((1, 1), (2, -1)):
+    def push(self, matches: Sequence[int], values: Sequence[float] | None = None) -> list[Followed]:
+        """Take the candidates of a new frame, and what is said for each of them; return what lies behind each."""
+        count, before = len(matches), len(self._matches)
+        runs, lasting = np.ones((len(self._signs), count), np.int64), np.zeros((len(self._signs), count))
+        steps = np.array(matches, np.int64)[:, None] - self._matches
+        for way, sign in enumerate(self._signs):
             follows = (sign * steps >= 0) & (sign * steps <= _LARGEST_STEP)
-            current[:, column] += np.where(follows, self._previous[:, column], 0).max(axis=1, initial=0)
-        self._previous = current
-        return current[:, 1:].max(axis=1).tolist() if self._both else current[:, 1].tolist()
+            if before and count:
+                of = np.where(follows, self._runs[way], 0)
+                longest = of.argmax(axis=1)
+                runs[way] += of.max(axis=1)
+                lasting[way] = np.where(follows.any(axis=1), self._lasting[way][longest], 0)
+        lasting = _MEMORY * lasting + (1 - _MEMORY) * np.array(values if values is not None else np.zeros(count))
+        self._matches, self._runs, self._lasting = np.array(matches, np.int64), runs, lasting
+        best = runs.argmax(axis=0)
+        return [Followed(int(runs[way, i]), float(lasting[way, i])) for i, way in enumerate(best)]
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the state, for `loopclosure.store`."""
-        return {"previous": self._previous}
+        return {"matches": self._matches, "runs": self._runs, "lasting": self._lasting}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> Consistency:
         """Take over the state that `to_arrays` gave."""
-        self._previous = arrays["previous"]
+        self._matches, self._runs, self._lasting = (arrays[name] for name in ("matches", "runs", "lasting"))
         return self

@@ -20,7 +20,8 @@ _SAMPLE = 2048  # places that a code is learned from
 _ROUNDS = 5  # of k-means; more of them find no more
 _SURVIVORS = 1000  # places, near by their codes, that are compared exactly
 _AT_ONCE = 1 << 15  # places that are coded in one go where an index is loaded
-_LARGEST = 256  # numbers in a vector; longer ones are always compared with all
+LONGEST = 256
+"""Numbers in a vector; longer ones are always compared with all."""
 _BITS, _LEVELS = 4, 16  # of one centre; how many there are
 _CODES = ("live", "next")
 
@@ -164,7 +165,8 @@ class PlaceIndex(VectorMap):
         for descriptor in arrays.get("descriptors", ()):
             self._store(descriptor)
         self.remove(arrays.get("removed", self._removed))
-        self._codes = [self._codes_again(saved) for name in _CODES if (saved := part(arrays, name))]
+        if self._whole > self._flat_up_to:
+            self._codes = [self._codes_again(saved) for name in _CODES if (saved := part(arrays, name))]
         if not self._codes:  # saved by a plain map, or small
             self._step()
             while self._codes and self.exact:
@@ -202,7 +204,7 @@ class PlaceIndex(VectorMap):
     def _step(self) -> None:
         """Learn a code where the map has outgrown the last one, and code a bounded number of places."""
         outgrown = _GROWTH * self._codes[-1].born if self._codes else self._flat_up_to
-        if self._whole > outgrown and len(self._codes) < len(_CODES) and self._blocks[0].shape[1] <= _LARGEST:
+        if self._whole > outgrown and len(self._codes) < len(_CODES) and self._blocks[0].shape[1] <= LONGEST:
             sample = self.rows(np.linspace(0, self._whole - 1, min(_SAMPLE, self._whole)).astype(np.int64))
             self._codes.append(_Codes.learn(sample, born=self._whole))
         for codes in self._codes:

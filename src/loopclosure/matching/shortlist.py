@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from loopclosure.matching.index import PlaceIndex
+from loopclosure.matching.scored import Scored
 from loopclosure.matching.sequences import SequenceScores
 from loopclosure.store import part
 
@@ -20,105 +21,76 @@ _WAYS = {"forward": 1, "backward": -1}
 class SequenceSearch:
     """Candidates of a new frame and their sequence scores, whatever the size of the map.
 
-    While the index compares with all places, so does this, by `SequenceScores`. Beyond that the candidates are the
-    places that the index finds for the new frame and those that come after the best candidates of the last one. The
-    scores of these are what `SequenceScores` would say: similarities are kept along each diagonal, and those that a new
-    candidate lacks are computed from the stored vectors.
+    While the index compares with all places, so does this. Beyond that the candidates are the places that the index
+    finds for the new frame and those that come after the best candidates of the last one. The scores of these are what
+    `SequenceScores` would say: similarities are kept along each diagonal, and those that a new candidate lacks are
+    computed from the stored vectors.
 
     Parameters
     ----------
     places : PlaceIndex
         The map. In one stream the new frame is added after `push`.
-    length, exclude_recent, both_directions, history
-        See `SequenceScores`.
-
-    Attributes
-    ----------
-    usual : ndarray of float32, shape (m,)
-        Scores, on the way forward, of up to 512 places that lie evenly spread over all that may be candidates, whether
-        they are like the frame or not: what chance gives. While all places are compared, the scores of all of these.
+    sums : SequenceScores
+        What scores all places, and says how: `length`, `exclude_recent`, `both_directions`, `history`.
 
     Examples
     --------
     >>> street = np.eye(4, dtype=np.float32)
-    >>> search = SequenceSearch(PlaceIndex().restore({"descriptors": street}), 2)
-    >>> search.push(street[1])
-    (array([], dtype=int64), array([], dtype=float32))
-    >>> search.push(street[2])
-    (array([1, 2, 3]), array([0.5, 1. , 0.5], dtype=float32))
+    >>> search = SequenceSearch(PlaceIndex().restore({"descriptors": street}), SequenceScores(2))
+    >>> search.push(street[1]).row()
+    array([nan, nan, nan, nan], dtype=float32)
+    >>> search.push(street[2]).row()
+    array([nan, 0.5, 1. , 0.5], dtype=float32)
     """
 
-    def __init__(
-        self,
-        places: PlaceIndex,
-        length: int,
-        *,
-        exclude_recent: int = 0,
-        both_directions: bool = False,
-        history: int | None = None,
-    ) -> None:
+    def __init__(self, places: PlaceIndex, sums: SequenceScores) -> None:
         self.places = places
-        self.length = length
-        self.exclude_recent = exclude_recent
-        self.history = history or length
+        self.length = sums.length
+        self.exclude_recent = sums.exclude_recent
+        self.history = sums.history
         self.frames = 0
-        self.usual = np.zeros(0, np.float32)
-        self._queries: deque[np.ndarray] = deque(maxlen=length)  # newest first
-        ways = _WAYS if both_directions else ("forward",)
-        self._diagonals = {way: _Diagonals(_WAYS[way], length) for way in ways}
-        self._spread = _Diagonals(_WAYS["forward"], length)
-        self._all: SequenceScores | None = SequenceScores(
-            length, exclude_recent=exclude_recent, both_directions=both_directions, history=history
-        )
+        self._queries: deque[np.ndarray] = deque(maxlen=self.length)  # newest first
+        ways = _WAYS if sums.both_directions else ("forward",)
+        self._diagonals = {way: _Diagonals(_WAYS[way], self.length) for way in ways}
+        self._spread = {way: _Diagonals(_WAYS[way], self.length) for way in ways}
+        self._all: SequenceScores | None = sums
 
-    def push(self, descriptor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Take the descriptor of a new frame and return its candidates.
-
-        Parameters
-        ----------
-        descriptor : ndarray of float32, shape (d,)
-
-        Returns
-        -------
-        ids : ndarray of int64, shape (c,)
-            In ascending order.
-        scores : ndarray of float32, shape (c,)
-            Larger = more alike.
-        """
+    def push(self, descriptor: np.ndarray) -> Scored:
+        """Take the descriptor of a new frame, float32 (d,), and return the scores of its candidates."""
         self.frames += 1
         self._queries.appendleft(np.asarray(descriptor, np.float32))
-        if self._all is not None and self.places.exact:
-            scores = self._all.push(self.places.similarities(descriptor))
-            ids = np.flatnonzero(~np.isnan(scores))
-            self.usual = scores[ids]
-            return ids, scores[ids]
+        if self._all is not None and (self.places.exact or len(self._queries) < min(self.frames, self.length)):
+            return Scored(self._all.push(self.places.similarities(descriptor)))
+        self._all = None  # a map does not shrink
         if self.frames < self.history:
-            return np.zeros(0, np.int64), np.zeros(0, np.float32)
+            return Scored.nothing(len(self.places))
         newest = len(self.places) - max(self.exclude_recent, 1)
         ways = self._diagonals.values()
         followed = [diagonals.follow(_FOLLOWED) for diagonals in ways]
         candidates = np.unique(np.concatenate([*self._found(newest), *followed]))
         queries = np.stack(self._queries)
-        self._score_spread(queries, *self._range("forward", newest))
         for way, diagonals in self._diagonals.items():
             diagonals.score(candidates, queries, self.places, self._range(way, newest))
-        return _best_way(ways)
+        ids, scores = _best_way(ways)
+        return Scored(scores, ids, usual=self._usual(queries, newest), places=len(self.places))
 
     def _found(self, newest: int) -> list[np.ndarray]:
         """Ask the index; the first time also for the frames before, whose places have moved on since."""
-        asked = list(self._queries) if self._all is not None else [self._queries[0]]
-        self._all = None  # a map does not shrink
+        asked = [self._queries[0]] if self._spread["forward"].ids.size else self._queries
         found = [self.places.search(query, _FOUND, newest=newest)[0] for query in asked]
         steps = [_WAYS[way] for way in self._diagonals]
         return [ids + step * age for age, ids in enumerate(found) for step in steps]
 
-    def _score_spread(self, queries: np.ndarray, first: int, last: int) -> None:
-        """Score every so many-th diagonal: they stay the same from frame to frame."""
+    def _usual(self, queries: np.ndarray, newest: int) -> Scored:
+        """Score every so many-th diagonal on the way forward, which stay the same from frame to frame."""
+        first, last = self._range("forward", newest)
         apart = 1 << max((last - first) // _SPREAD, 0).bit_length()
         ids = np.arange(first + (self.frames - first) % apart, last + 1, apart)
-        self._spread.follow(ids.size)
-        self._spread.score(ids, queries, self.places, (first, last))
-        self.usual = self._spread.scores
+        for way, diagonals in self._spread.items():
+            diagonals.follow(ids.size)
+            diagonals.score(ids, queries, self.places, self._range(way, newest))
+        ids, scores = _best_way(self._spread.values())
+        return Scored(scores, ids)
 
     def _range(self, way: str, newest: int) -> tuple[int, int]:
         """First and last place that may be a candidate, as in `SequenceScores`."""
@@ -130,24 +102,27 @@ class SequenceSearch:
         return 0, newest - reach
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """Return the state without the map, for `loopclosure.store`."""
-        parts = {way: diagonals.to_arrays() for way, diagonals in self._diagonals.items()}
-        parts["spread"] = self._spread.to_arrays()
+        """Return the state without the map, for `loopclosure.store`: that of `sums`, as long as all are compared."""
+        queries = {f"query{i}": query for i, query in enumerate(self._queries)}
         if self._all is not None:
-            parts["all"] = self._all.to_arrays()
+            return self._all.to_arrays() | queries
+        parts = {way: diagonals.to_arrays() for way, diagonals in self._diagonals.items()}
+        parts |= {f"spread-{way}": diagonals.to_arrays() for way, diagonals in self._spread.items()}
         arrays = {f"{name}.{key}": array for name, arrays in parts.items() for key, array in arrays.items()}
-        arrays |= {f"query{i}": query for i, query in enumerate(self._queries)}
-        return arrays | {"frames": np.array(self.frames)}
+        return arrays | queries | {"frames": np.array(self.frames)}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> SequenceSearch:
-        """Take over the state that `to_arrays` gave; the map is restored already."""
+        """Take over the state that `to_arrays` gave, or that of `sums` alone; the map is restored already."""
         self.frames = int(arrays["frames"])
-        self._queries.extend(arrays[f"query{i}"] for i in range(min(self.frames, self.length)))
+        names = (f"query{i}" for i in range(self.length))
+        self._queries.extend(arrays[name] for name in names if name in arrays)
+        if self._all is not None and "forward" in arrays:
+            self._all.restore(arrays)
+            return self
+        self._all = None
         for way, diagonals in self._diagonals.items():
             diagonals.restore(part(arrays, way))
-        self._spread.restore(part(arrays, "spread"))
-        everything = part(arrays, "all")
-        self._all = self._all.restore(everything) if self._all is not None and everything else None
+            self._spread[way].restore(part(arrays, f"spread-{way}"))
         return self
 
 

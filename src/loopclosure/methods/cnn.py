@@ -13,7 +13,6 @@ import numpy as np
 
 from loopclosure.aggregation.pooling import pool_cells
 from loopclosure.compression import choose_components
-from loopclosure.compression.autoencoder import Autoencoder
 from loopclosure.compression.spectrum import degenerate_below, whitening
 from loopclosure.config import Config
 from loopclosure.errors import ConfigError, FitError, ModelError
@@ -44,6 +43,8 @@ def cnn(
 
 def cnn_ae(config: Config, *, progress: Callable[[int, int], None] | None = None) -> VectorMethod:
     """Build the method `cnn-ae`: each cell through the bottleneck of an autoencoder, as long as KL's code."""
+    from loopclosure.compression.autoencoder import Autoencoder  # loads torch, which its relatives can do without
+
     rule = config.compression
     if rule.energy is not None or rule.whiten or rule.gamma == "auto":
         raise ConfigError("cnn-ae knows a number for compression.gamma, and compression.components, only")

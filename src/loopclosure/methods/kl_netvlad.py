@@ -15,6 +15,7 @@ from loopclosure.compression import READINGS, ChannelKL, FlatKL, SequenceKL
 from loopclosure.config import Config
 from loopclosure.errors import FitError
 from loopclosure.features.networks import open_network
+from loopclosure.matching.index import LONGEST, PlaceIndex
 from loopclosure.matching.similarity import SetMap, VectorMap
 from loopclosure.methods.base import Method
 from loopclosure.store import part
@@ -163,7 +164,9 @@ class KLNetVLAD(Method):
         return self._blank
 
     def new_map(self, *, exclude_recent: int) -> VectorMap:  # noqa: ARG002  (all pairs cost the same here)
-        """Return an empty map for the descriptors."""
+        """Return an empty map for the descriptors; whitened ones have an index where they are many."""
+        if 0 < self._components <= LONGEST:
+            return PlaceIndex(flat_up_to=self.config.matching.flat_up_to)
         return SetMap() if self._reading == "sequence" else VectorMap()
 
     def to_arrays(self) -> dict[str, np.ndarray]:

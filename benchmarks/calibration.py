@@ -12,7 +12,7 @@ from files that exist: `--rows a.npz b.npz` joins the cases of two runs.
 import argparse
 import hashlib
 from functools import partial
-from itertools import chain
+from itertools import chain, cycle, islice
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from loopclosure.verification import Verifier
 
 LENGTHS = 10, 5, 1
 RIGHT, WRONG, TOLERANCE = 3, 10, 2
-BARS = 1.0, 2.0, 3.0, 3.2, 4.0, 5.0
+BARS = 1.0, 2.0, 3.0, 4.0, 4.4, 5.0
 PAIRS = {
     "day": ("gardens_point/day_left", "gardens_point/day_right"),
     "night": ("gardens_point/day_right", "gardens_point/night_right"),
@@ -44,6 +44,17 @@ DRIVES = {
     "sim no loop, crowded": {"seed": 31, "frames": 1000, "revisit": False, "covered": 0.4},
     "sim no loop, night": {"seed": 32, "frames": 1000, "revisit": False, "covered": 0.2, "light": "night"},
     "sim no loop, dusk": {"seed": 33, "frames": 1000, "revisit": False, "covered": 0.3, "light": "dusk"},
+} | {
+    f"sim no loop, {light}, {covered:.0%} covered": {
+        "seed": 40 + i,
+        "frames": 1000,
+        "revisit": False,
+        "covered": covered,
+        "light": light,
+    }
+    for i, (light, covered) in enumerate(
+        zip(islice(cycle(("day", "dusk", "night")), 10), 2 * (0.0, 0.1, 0.2, 0.3, 0.4), strict=True)
+    )
 }
 COLUMNS = "case", "length", "query", "rank", "off", "loop", "full"  # then the features
 

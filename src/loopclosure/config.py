@@ -157,7 +157,7 @@ class Decide(Section):
     """From the best score to a decision."""
 
     false_loops_per_1000: float = Field(
-        0.3, gt=0, le=1000, description="false loops that are allowed in 1000 frames, where a score is a probability"
+        0.15, gt=0, le=1000, description="false loops that are allowed in 1000 frames, where a score is a probability"
     )
     threshold: float | None = Field(
         None, description="least score of a loop; none = by false_loops_per_1000, or the method's own"

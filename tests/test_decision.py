@@ -20,7 +20,7 @@ STRONG = Evidence(match=3, similarity=0.8, standing=6.0, run=40, lasting=3.0, su
 DEFAULT_RATE = Config().decision.false_loops_per_1000
 
 
-@pytest.mark.parametrize("better", [{"standing": 3.0}, {"run": 12}, {"lasting": 2.0}, {"support": 6.0}])
+@pytest.mark.parametrize("better", [{"standing": 3.0}, {"run": 12}, {"lasting": 2.0}, {"support": 12.0}])
 def test_each_piece_of_evidence_raises_the_odds(better):
     assert replace(WEAK, **better).log_odds > WEAK.log_odds
 

@@ -25,8 +25,9 @@ _RATIO = 0.87
 _UNITS = 640  # of length, along the longer side of an image: cameras differ in resolution
 _THRESHOLD = 1.5  # units to the model
 _STILL = 1.5  # units that a match moves at most when it belongs to the camera
-_HARDLY_MOVED = 25.0  # units that a point moves at most in a few frames when it goes along with the robot
-_STANDS = 0.6  # share of still matches above which it is the camera that stands
+_HARDLY_MOVED = 80.0  # units that a point moves at most in a few frames when it goes along with the robot
+_STANDS = 0.6  # share of still matches of two drives above which the camera stands alike in both
+_CREEPS = 0.9  # share of the matches with an earlier view that hardly moved, above which the robot stands or creeps
 
 
 class Effort(NamedTuple):
@@ -205,7 +206,9 @@ class Verifier:
         return replace(found, verified=True, motion=self._motion(found, max(query.size)))
 
     def without_still(self, features: LocalFeatures, earlier: LocalFeatures) -> LocalFeatures:
-        """Leave out what stays where it was in an earlier view of the same drive, unless the camera stands.
+        """Leave out what stays about where it was in an earlier view of the same drive, unless everything does.
+
+        A lorry ahead grows and shrinks a little; what stands at the side of the street passes by.
 
         Parameters
         ----------
@@ -216,7 +219,7 @@ class Verifier:
         found = pairs[distinct]
         moved = features.points[found[:, 0]] - earlier.points[found[:, 1]]
         still = np.linalg.norm(moved, axis=1) * (_UNITS / max(features.size)) < _HARDLY_MOVED
-        if features.size != earlier.size or still.sum() > _STANDS * len(features):
+        if features.size != earlier.size or still.sum() > _CREEPS * len(found):
             return features
         moving = np.full(len(features), True)
         moving[found[still, 0]] = False

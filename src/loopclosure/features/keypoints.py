@@ -132,9 +132,9 @@ class KeypointExtractor:
         if self.kind != "corners":
             return self._detector.detectAndCompute(grey, None)
         corners = cv2.goodFeaturesToTrack(grey, self.max_features, _CORNER_QUALITY, _CORNER_DISTANCE)
-        strongest_first = range(len(corners), 0, -1) if corners is not None else ()
+        points = [] if corners is None else corners[:, 0].tolist()  # strongest first
         return self._detector.compute(
-            grey, [cv2.KeyPoint(*corners[-i, 0].tolist(), _CORNER_SIZE, 0, i) for i in strongest_first]
+            grey, [cv2.KeyPoint(x, y, _CORNER_SIZE, 0, len(points) - rank) for rank, (x, y) in enumerate(points)]
         )
 
 

@@ -73,6 +73,7 @@ _SUPPORT_BY_CHANCE, _MOST_SUPPORT = 6.0, 20.0  # two lorries of one model reach 
 _WEIGHTS = 0.862, 0.097, 1.030, 2.452
 _CONSTANT = -7.120
 _FALSE_PER_1000 = 12.0  # false loops among 1000 frames that no loop is in, at even odds
+_LOOKS = 3  # candidates of a frame, at most, that are verified
 _WORTH_A_LOOK = -6.0  # log-odds; below, geometry would have to be surer than it ever is by itself
 
 
@@ -188,8 +189,10 @@ class Judge:
             for candidate, behind in zip(candidates, followed, strict=True)
         ]
         if self._witness is not None:
-            doubtful = [one.match for one in found if one.log_odds >= _WORTH_A_LOOK]
-            heard = self._witness.hear(query, [one.match for one in found], look_at=doubtful)
+            likely = sorted((one for one in found if one.log_odds >= _WORTH_A_LOOK), key=lambda one: -one.log_odds)
+            heard = self._witness.hear(
+                query, [one.match for one in found], look_at=[one.match for one in likely[:_LOOKS]]
+            )
             found = [replace(one, **two._asdict()) for one, two in zip(found, heard, strict=True)]
         return tuple(sorted(found, key=lambda one: -one.log_odds)) if self.method.calibrated else tuple(found)
 

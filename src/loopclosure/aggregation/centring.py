@@ -36,8 +36,17 @@ def centre_traverse(descriptors: np.ndarray, *, window: int) -> tuple[np.ndarray
         return descriptors, None
     mean = descriptors[counted].mean(0, dtype=np.float64).astype(np.float32)
     centred = np.zeros_like(descriptors)
-    centred[counted] = unit(descriptors[counted] - mean)
+    centred[counted] = _left_over(descriptors[counted], mean)
     return centred, mean
+
+
+_NOTHING = 1e-3  # of a descriptor's length: a frame that is all that recent frames share leaves rounding errors
+
+
+def _left_over(descriptors: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    left = descriptors - mean
+    lengths = [np.linalg.norm(vectors, axis=-1, keepdims=True) for vectors in (left, descriptors)]
+    return unit(np.where(lengths[0] > _NOTHING * lengths[1], left, 0))
 
 
 _PRIOR_FRAMES = 20  # the prior weighs as much as this many frames still missing
@@ -81,7 +90,7 @@ class RunningMean:
             self._sum -= self._recent[0]
         self._recent.append(descriptor)
         self._sum += descriptor
-        return unit(descriptor - self._mean(self._sum).astype(np.float32))
+        return _left_over(descriptor, self._mean(self._sum).astype(np.float32))
 
     def _mean(self, total: np.ndarray) -> np.ndarray:
         missing = min(_PRIOR_FRAMES, self.window) - len(self._recent)

@@ -105,12 +105,14 @@ class NetVLAD:
         self.bias_ = -alpha * np.square(self.centres_).sum(1)
         return self
 
-    def transform(self, maps: np.ndarray) -> np.ndarray:
+    def transform(self, maps: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
         """Describe each image.
 
         Parameters
         ----------
         maps : ndarray of float, shape (n, h, w, D)
+        weights : ndarray of float32, shape (n, h, w), optional
+            What each position counts; all the same by default.
 
         Returns
         -------
@@ -132,6 +134,8 @@ class NetVLAD:
             )
         local = unit(np.asarray(maps, np.float32).reshape(len(maps), maps.shape[1] * maps.shape[2], depth))
         assignment = _softmax(local @ self.weights_.T + self.bias_)
+        if weights is not None:
+            assignment *= weights.reshape(len(maps), -1, 1)
         residuals = assignment.transpose(0, 2, 1) @ local
         residuals -= assignment.sum(1)[:, :, None] * self.centres_
         blank = ~local.any(axis=(1, 2))

@@ -17,7 +17,7 @@ class Followed(NamedTuple):
     Attributes
     ----------
     run : int
-        Frames over which it has moved on steadily.
+        Frames over which it has moved on steadily, those alone in which something was said for it.
     lasting : float
         Mean of what was said for it in each of these frames, older ones counting less; frames before the run count as
         zero.
@@ -32,7 +32,8 @@ class Consistency:
 
     From one frame to the next a candidate may stay or move by up to three frames, always the same way: forward, or
     backward where `both_directions` is asked. A moving thing that follows the robot, or two streets that look alike,
-    rarely keeps that up.
+    rarely keeps that up. Where it is told what speaks for a candidate, only frames count in which that is more than
+    nothing: among few places even chance keeps one near the best for long.
 
     Examples
     --------
@@ -50,16 +51,18 @@ class Consistency:
     def push(self, matches: Sequence[int], values: Sequence[float] | None = None) -> list[Followed]:
         """Take the candidates of a new frame, and what is said for each of them; return what lies behind each."""
         count, before = len(matches), len(self._matches)
-        runs, lasting = np.ones((len(self._signs), count), np.int64), np.zeros((len(self._signs), count))
+        told = np.array(values if values is not None else np.zeros(count))
+        runs, lasting = np.zeros((len(self._signs), count), np.int64), np.zeros((len(self._signs), count))
         steps = np.array(matches, np.int64)[:, None] - self._matches
         for way, sign in enumerate(self._signs):
             follows = (sign * steps >= 0) & (sign * steps <= _LARGEST_STEP)
             if before and count:
-                of = np.where(follows, self._runs[way], 0)
-                longest = of.argmax(axis=1)
-                runs[way] += of.max(axis=1)
-                lasting[way] = np.where(follows.any(axis=1), self._lasting[way][longest], 0)
-        lasting = _MEMORY * lasting + (1 - _MEMORY) * np.array(values if values is not None else np.zeros(count))
+                longest = np.where(follows, self._runs[way], -1).argmax(axis=1)
+                goes_on = follows.any(axis=1)
+                runs[way] = np.where(goes_on, self._runs[way][longest], 0)
+                lasting[way] = np.where(goes_on, self._lasting[way][longest], 0)
+        runs += told > 0 if values is not None else 1
+        lasting = _MEMORY * lasting + (1 - _MEMORY) * told
         self._matches, self._runs, self._lasting = np.array(matches, np.int64), runs, lasting
         best = runs.argmax(axis=0)
         return [Followed(int(runs[way, i]), float(lasting[way, i])) for i, way in enumerate(best)]

@@ -116,7 +116,7 @@ METHODS: dict[str, MethodEntry] = {
         "KL basis and clusters, on the drive itself or by `fit`",
         _kl_netvlad,
         weights="efficientnet-lite0",
-        numbers=64,
+        numbers=128,
     ),
     "netvlad-resnet152": MethodEntry(
         "conv5 of ResNet-152 as a NetVLAD descriptor, uncompressed",

@@ -62,6 +62,8 @@ class Method(ABC):
         Whether descriptors are vectors from which the running mean of the traverse is taken out.
     window : int
         Frames whose features one descriptor is made of.
+    whole_sequences : bool
+        Whether one descriptor stands for all frames of a sequence.
     threshold : float
         Least score of a loop where the configuration sets none.
     calibrated : bool
@@ -76,6 +78,7 @@ class Method(ABC):
     fitted = True
     centred = False
     window = 1
+    whole_sequences = False
     threshold = 0.5
     calibrated = False
     sums: type[SequenceScores] = SequenceScores
@@ -113,7 +116,7 @@ class Method(ABC):
         """Return what sums similarities over sequences: Eq. 20 unless the method brings its own."""
         sequence = self.config.sequence
         return self.sums(
-            1 if self.window > 1 else sequence.length,
+            1 if self.whole_sequences else sequence.length,
             exclude_recent=exclude_recent,
             both_directions=sequence.direction == "both",
             history=sequence.length,

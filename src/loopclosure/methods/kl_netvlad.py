@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from loopclosure.aggregation.centring import centre_traverse
+from loopclosure.aggregation.change import change
+from loopclosure.aggregation.layout import layout
 from loopclosure.aggregation.netvlad import NetVLAD, unit
 from loopclosure.aggregation.reduction import Reduction
 from loopclosure.aggregation.selection import GAMMAS, margin
@@ -24,8 +26,10 @@ from loopclosure.store import part
 class KLNetVLAD(Method):
     """Describe images by compressed ConvNet features.
 
-    Where the mean of the traverse is taken out, ``aggregation.components`` whitened numbers are kept of a NetVLAD
-    descriptor. Similarities then mean the same on every drive, and `loopclosure.decision` knows the odds of a loop.
+    Where the mean of the traverse is taken out, the layout of the map stands beside NetVLAD
+    (`loopclosure.aggregation.layout`), and ``aggregation.components`` whitened numbers are kept of each of the two.
+    What has not changed in the view over the last frames counts less (`loopclosure.aggregation.change`). Similarities
+    then mean the same on every drive, and `loopclosure.decision` knows the odds of a loop.
 
     The reading of the KL transform (``compression.reading``) decides what a frame's descriptor is:
 
@@ -72,9 +76,12 @@ class KLNetVLAD(Method):
         if not config.aggregation.centre_window:
             self._components = 0
         self.calibrated = bool(self._components)
+        self._weights = config.aggregation.weights if self._components else (1.0,)
         self._blank: np.ndarray | None = None
         if self._reading == "sequence":
-            self.window = config.sequence.length
+            self.window, self.whole_sequences = config.sequence.length, True
+        elif self._components:
+            self.window = config.aggregation.change_over + 1
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -110,7 +117,9 @@ class KLNetVLAD(Method):
             self._netvlad.fit(code)
         if self._components:
             descriptors, _ = centre_traverse(self.aggregate(code), window=len(maps))
-            self._reduction = Reduction(self._components).fit(descriptors)
+            described = self._netvlad.centres_.size
+            sizes = (described, descriptors.shape[1] - described)[: len(self._weights)]
+            self._reduction = Reduction(self._components, weights=self._weights).fit(descriptors, sizes=sizes)
 
     def _margin(self, maps: np.ndarray, gamma: float) -> float:
         """Return how well places are told apart with this compression ratio."""
@@ -133,13 +142,13 @@ class KLNetVLAD(Method):
         """
         if not self.fitted:
             raise FitError("the method has learned no basis and no clusters yet; call fit first")
-        stacked = np.stack(features)
         if self._reading == "sequence":
-            return self.aggregate(self.compress(self._padded(stacked)))
-        return self.aggregate(self.compress(stacked))[0]
+            return self.aggregate(self.compress(self._padded(np.stack(features))))
+        weights = change(features[-1], features[0])[None] if self.window > 1 else None
+        return self.aggregate(self.compress(features[-1][None]), weights)[0]
 
     def reduce(self, centred: np.ndarray) -> np.ndarray:
-        """Return the whitened descriptor, float32 (aggregation.components,), or the same where that is 0."""
+        """Return the whitened descriptor, float32 (parts * aggregation.components,), or the same where that is 0."""
         return centred if self._reduction is None else self._reduction.transform(centred)
 
     def compress(self, maps: np.ndarray) -> np.ndarray:
@@ -148,9 +157,17 @@ class KLNetVLAD(Method):
             self._kl.fit(maps)  # nothing is learned across sequences
         return maps if self._kl is None else self._kl.transform(maps)
 
-    def aggregate(self, code: np.ndarray) -> np.ndarray:
-        """Return one descriptor for each code that `compress` gave, float32 (n, d)."""
-        return unit(code) if self._reading == "flat" else self._netvlad.transform(code)
+    def aggregate(self, code: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+        """Return one descriptor, float32 (n, d), for each code that `compress` gave.
+
+        ``weights``, float32 (n, h, w), say what each position counts.
+        """
+        if self._reading == "flat":
+            return unit(code)
+        descriptors = self._netvlad.transform(code, weights)
+        if len(self._weights) == 1:
+            return descriptors
+        return np.hstack([descriptors, layout(code if weights is None else code * weights[..., None])])
 
     def _padded(self, maps: np.ndarray) -> np.ndarray:
         """Fill a window that is not full yet with its first frame."""
@@ -187,5 +204,5 @@ class KLNetVLAD(Method):
         if self._reading != "flat":
             self._netvlad = NetVLAD.from_arrays(part(arrays, "netvlad"), seed=self.config.learning.seed)
         if self._components:
-            self._reduction = Reduction.from_arrays(part(arrays, "reduction"))
+            self._reduction = Reduction.from_arrays(part(arrays, "reduction"), weights=self._weights)
         self.fitted = True

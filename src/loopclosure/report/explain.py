@@ -16,11 +16,12 @@ from matplotlib.figure import Figure
 
 from loopclosure import __version__
 from loopclosure.config import Config
-from loopclosure.detect import Frames, LoopDetector
+from loopclosure.detect import LoopDetector
 from loopclosure.errors import FitError, ImageError, ResultsError
 from loopclosure.evaluation.log import LOOPS_FILE, read_loops
 from loopclosure.images.decode import read_image
 from loopclosure.images.sequence import ImageSequence
+from loopclosure.perception import Frames
 from loopclosure.report.heatmaps import Explainer, View, check_explainable, cosine, matches
 from loopclosure.report.means import means_taken_out
 from loopclosure.report.overlays import draw_clusters, draw_heat
@@ -102,8 +103,11 @@ def explain_run(
     means = means_taken_out(detector, pairs, queries, references, lambda *count: report("mean of the drive", *count))
     plates: list[_Plate] = []
     for number, pair in enumerate(pairs):
-        left = explainer.look(_frame(queries, pair.query), means[0][pair.query])
-        right = explainer.look(_frame(references or queries, pair.match), means[1][pair.match])
+        window = detector.method.window
+        left, right = (
+            explainer.look(_frame(images, frame), mean[frame], before=_before(images, frame, window))
+            for images, frame, mean in ((queries, pair.query, means[0]), (references or queries, pair.match, means[1]))
+        )
         names = (f"query {pair.query}", f"match {pair.match}")
         said = f"Score {pair.score:.3f}, {'accepted' if pair.accepted else 'not accepted'}. "
         plates += _draw(Path(out), explainer, (left, right), names, said, f"{pair.query:06}_{pair.match:06}")
@@ -226,6 +230,12 @@ def _frame(images: Frames, position: int) -> np.ndarray:
     return image
 
 
+def _before(images: Frames, position: int, window: int) -> np.ndarray | None:
+    """Return the first readable frame of those that a descriptor is made of, if any stands before its own."""
+    earlier = (images[i] for i in range(max(position + 1 - window, 0), position))
+    return next((image for image in earlier if image is not None), None)
+
+
 def _draw(
     out: Path, explainer: Explainer, views: Sequence[View], names: Sequence[str], said: str, suffix: str
 ) -> list[_Plate]:
@@ -260,9 +270,9 @@ def _plate(out: Path, file: str, title: str, text: str, figure: Figure) -> _Plat
 
 def _write(out: Path, title: str, detector: LoopDetector, plates: list[_Plate], centred: str) -> Explanation:
     arrays, spectrum = detector.method.to_arrays(), None
-    learned = next((stage for stage in ("kl", "reduction") if f"{stage}.energies" in arrays), None)
+    learned = next((name for name in ("kl.{}", "reduction.{}0") if name.format("energies") in arrays), None)
     if learned is not None:
-        figure = kl_spectrum(arrays[f"{learned}.energies"], kept=len(arrays[f"{learned}.basis"]))
+        figure = kl_spectrum(arrays[learned.format("energies")], kept=len(arrays[learned.format("basis")]))
         spectrum = _plate(out, "spectrum.png", "KL spectrum", "", figure)
     text = resources.files(__package__).joinpath(PAGE).read_text(encoding="utf-8")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)

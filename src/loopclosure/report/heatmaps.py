@@ -18,6 +18,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from loopclosure.aggregation.change import change
 from loopclosure.aggregation.netvlad import NetVLAD, unit
 from loopclosure.aggregation.netvlad_torch import NetVLADLayer
 from loopclosure.compression import ChannelKL
@@ -55,6 +56,8 @@ class View(NamedTuple):
         RGB.
     maps : ndarray of float32, shape (h, w, c)
         The tap of the backbone.
+    weights : ndarray of float32, shape (h, w)
+        What each position counts.
     residuals : ndarray of float32, shape (h, w, K, D)
         What each position adds to the descriptor; their sum is the descriptor before centring.
     clusters : ndarray of int64, shape (h, w)
@@ -67,6 +70,7 @@ class View(NamedTuple):
 
     image: np.ndarray
     maps: np.ndarray
+    weights: np.ndarray
     residuals: np.ndarray
     clusters: np.ndarray
     mean: np.ndarray
@@ -82,13 +86,21 @@ class Match(NamedTuple):
 
 
 class Residuals(NetVLADLayer):
-    """NetVLAD before its sum over positions: (n, D, h, w) to (n, K * D, h, w)."""
+    """NetVLAD before its sum over positions: (n, D, h, w) to (n, K * D, h, w).
+
+    Attributes
+    ----------
+    weights_of_positions : Tensor
+        What each position counts, (h, w) or one number.
+    """
+
+    weights_of_positions = torch.ones(())
 
     def forward(self, codes: torch.Tensor) -> torch.Tensor:
         """Return what each position adds to each cluster."""
         local = functional.normalize(codes, dim=1).permute(0, 2, 3, 1)
         residuals = self._assign(local)[..., None] * (local[..., None, :] - self.centres)
-        return residuals.flatten(3).permute(0, 3, 1, 2)
+        return residuals.flatten(3).permute(0, 3, 1, 2) * self.weights_of_positions
 
     def clusters(self, codes: torch.Tensor) -> torch.Tensor:
         """Return the cluster that takes most of each position, (n, h, w)."""
@@ -165,18 +177,33 @@ class Explainer:
         self._network = DescriptorNetwork(method).eval()
         self._cam = _grad_cam()(self._network, [self._network.residuals])
 
-    def look(self, image: np.ndarray, mean: np.ndarray | None = None) -> View:
-        """Describe an image, uint8 (H, W, 3), with `mean`, float32 (K * D,), taken out of its descriptor."""
-        maps = self._method.features([image])[0]
+    def look(self, image: np.ndarray, mean: np.ndarray | None = None, *, before: np.ndarray | None = None) -> View:
+        """Describe an image by NetVLAD.
+
+        Parameters
+        ----------
+        image : ndarray of uint8, shape (H, W, 3)
+            RGB.
+        mean : ndarray of float32, shape (K * D,) or longer, optional
+            What is taken out of the descriptor.
+        before : ndarray of uint8, shape (H, W, 3), optional
+            The frame of the drive since which the view must have changed to count, see
+            `loopclosure.aggregation.change`; without it all positions count.
+        """
+        features = self._method.features([image] if before is None else [before, image])
+        maps, weights = features[-1], np.ones(features[-1].shape[:2], np.float32)
+        if before is not None and self._method.window > 1:
+            weights = change(maps, features[0])
+        self._network.residuals.weights_of_positions = torch.from_numpy(weights)
         with torch.no_grad():
             codes = self._network.compress(_tensor(maps))
             residuals = self._network.residuals(codes)
             parts = (residuals / self._network.lengths(residuals))[0].permute(1, 2, 0).numpy()
             clusters = self._network.residuals.clusters(codes)[0].numpy()
-        plain = self._method.describe([maps])
-        mean = np.zeros_like(plain) if mean is None else mean
+        plain = self._method.describe(features)[: parts.shape[-1]]  # what stands behind NetVLAD is the layout
+        mean = np.zeros_like(plain) if mean is None else mean[: plain.size]
         parts = parts.reshape(*maps.shape[:2], self._network.count, -1)
-        return View(image, maps, parts, clusters, mean, unit(plain - mean))
+        return View(image, maps, weights, parts, clusters, mean, unit(plain - mean))
 
     def heat(self, view: View, other: View) -> np.ndarray:
         """Return where the similarity of the two descriptors comes from, by Grad-CAM.
@@ -193,6 +220,7 @@ class Explainer:
         ndarray of float32, shape (H, W)
             0: nothing, or against the similarity; 1: most.
         """
+        self._network.residuals.weights_of_positions = torch.from_numpy(view.weights)
         heat = self._cam(_tensor(view.maps).requires_grad_(), [_dot(other.descriptor)])[0]
         height, width = view.image.shape[:2]
         return np.clip(cv2.resize(heat, (width, height), interpolation=cv2.INTER_CUBIC), 0, 1)

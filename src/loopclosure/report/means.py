@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from loopclosure.aggregation.centring import RunningMean
-from loopclosure.detect import Frames, LoopDetector
+from loopclosure.detect import LoopDetector
 from loopclosure.images.sequence import ImageSequence
 from loopclosure.methods import Method
+from loopclosure.perception import Frames
 from loopclosure.report.pairs import Pair
+from loopclosure.traverse import describe
 
 
 def means_taken_out(
@@ -64,8 +67,8 @@ def _running_means(
     found: dict[int, np.ndarray | None] = {}
     last = max(wanted) + 1
     for frame in sorted(wanted):
-        for i in range(max(done, frame + 1 - window), frame + 1):
-            mean.centre(_described(method, images[i]))
+        for i, descriptor in _described(method, images, range(max(done, frame + 1 - window), frame + 1)):
+            mean.centre(descriptor)
             progress(i + 1, last)
         done = frame + 1
         found[frame] = mean.current
@@ -74,13 +77,18 @@ def _running_means(
 
 def _mean_of(method: Method, images: Frames, frames: range, progress: Callable[[int, int], None]) -> np.ndarray | None:
     total, count = np.zeros_like(method.blank(), np.float64), 0
-    for i in frames:
-        descriptor = _described(method, images[i])
+    for i, descriptor in _described(method, images, frames):
         total += descriptor
         count += bool(descriptor.any())  # a blank frame is not counted
         progress(i + 1, len(frames))
     return (total / count).astype(np.float32) if count else None
 
 
-def _described(method: Method, image: np.ndarray | None) -> np.ndarray:
-    return method.blank() if image is None else method.describe(method.features([image]))
+def _described(method: Method, images: Frames, frames: range) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield the descriptors of some frames, each described with those before it as in the drive."""
+    recent: deque[np.ndarray] = deque(maxlen=method.window)
+    for i in range(max(frames.start + 1 - method.window, 0), frames.stop):
+        image = images[i]
+        descriptor = describe(method, None if image is None else method.features([image])[0], recent)
+        if i in frames:
+            yield i, descriptor

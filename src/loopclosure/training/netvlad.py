@@ -13,6 +13,7 @@ from torch import nn
 
 from loopclosure import store
 from loopclosure.aggregation.centring import centre_traverse
+from loopclosure.aggregation.layout import layout
 from loopclosure.aggregation.netvlad import NetVLAD
 from loopclosure.aggregation.netvlad_torch import NetVLADLayer
 from loopclosure.aggregation.reduction import Reduction
@@ -181,7 +182,7 @@ class NetVLADTask:
                 "learned or held-out frames have no other visit left: use a longer drive, or another training.held_out"
             )
         self._members = everything.members
-        self._components = config.aggregation.components
+        self._aggregation = config.aggregation
         self.kl, netvlad = _fitted(backbone, data.images, self.places.members, config)
         self.network = Describer(backbone.module, self.kl, netvlad).to(backbone.device)
         self.parameters: Mapping[str, torch.nn.Parameter] = {
@@ -254,11 +255,25 @@ class NetVLADTask:
         arrays = {f"netvlad.{name}": array for name, array in layer.to_arrays().items()}
         if self.kl is not None:
             arrays |= {f"kl.{name}": array for name, array in self.kl.to_arrays().items()}
-        centred, mean = centre_traverse(self.describe(self._members), window=1)
-        if self._components:
-            reduction = Reduction(self._components).fit(centred)
+        described = self.describe(self._members)
+        sizes, weights = [described.shape[1]], self._aggregation.weights
+        if len(weights) > 1:
+            described = np.hstack([described, self._layouts()])
+            sizes.append(described.shape[1] - sizes[0])
+        centred, mean = centre_traverse(described, window=1)
+        if self._aggregation.components:
+            reduction = Reduction(self._aggregation.components, weights=weights).fit(centred, sizes=sizes)
             arrays |= {f"reduction.{name}": array for name, array in reduction.to_arrays().items()}
         return arrays | ({} if mean is None else {"mean_of_fit": mean})
+
+    def _layouts(self) -> np.ndarray:
+        """Return the layout of each frame, as `KLNetVLAD` puts it beside NetVLAD."""
+        found = []
+        with torch.no_grad():
+            for some in in_batches(self._members, TOGETHER):
+                codes = self._codes_of(np.array(some))
+                found.append(layout(codes.permute(0, 2, 3, 1).float().cpu().numpy()))
+        return np.concatenate(found)
 
     def _mine(self, query: int, descriptors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         members = self.places.members
@@ -284,13 +299,16 @@ class NetVLADTask:
 
     def _vectors(self, frames: np.ndarray, *, seed: int | None = None) -> torch.Tensor:
         """Describe frames; with a seed, frames that are seen otherwise."""
+        return cast(torch.Tensor, self.network.layer(self._codes_of(frames, seed=seed)))
+
+    def _codes_of(self, frames: np.ndarray, *, seed: int | None = None) -> torch.Tensor:
         if self._codes is not None:
             rows = torch.from_numpy(np.searchsorted(self._members, frames)).to(self._codes.device)
-            return cast(torch.Tensor, self.network.layer(self._codes[rows]))
+            return self._codes[rows]
         images = list(self._read(frames))
         if seed is not None and self._augmentation:
             images = self._augmentation(images, seed=seed)
-        return cast(torch.Tensor, self.network.layer(self._code(images)))
+        return self._code(images)
 
     def _read(self, frames: Iterable[int]) -> Iterator[Image]:
         return read_ahead(self._images[int(frame)] for frame in frames)

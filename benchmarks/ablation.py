@@ -24,7 +24,11 @@ PARTS = {
     "no verification": {"verification.mode": "none"},
     "strict verification": {"verification.mode": "strict"},
     "no whitening (and a threshold)": {"aggregation.components": 0},
-    "128 whitened numbers": {"aggregation.components": 128},
+    "128 whitened numbers a part": {"aggregation.components": 128},
+    "no layout": {"aggregation.layout": 0},
+    "layout as heavy as NetVLAD": {"aggregation.layout": 1.0},
+    "what rides along counts as well": {"aggregation.change_over": 0},
+    "neither": {"aggregation.layout": 0, "aggregation.change_over": 0},
     "nothing taken out (and a threshold)": {"aggregation.centre_window": 0},
     "KL before NetVLAD, gamma 0": {"compression.gamma": 0.0},
     "KL before NetVLAD, gamma 0.6": {"compression.gamma": 0.6},
@@ -46,12 +50,13 @@ def main():
     network = LoopDetector().method.features
     found = {part: [] for part in args.parts.split(";")}
     for name in args.cases.split(";"):
-        reference, images, true = known[name][1]()
+        reference, images, true, loop = known[name][1]()
         maps = Remembered(lambda image: network([image])[0])
-        local = {mode: Remembered(Verifier(mode).features) for mode in ("fast", "strict")}
+        local = {mode: Remembered(Verifier(mode).features) for mode in ("fast", "strict")} | {"none": None}
         for part in found:
             config = Config().with_settings({"sequence.length": args.length, **PARTS[part]})
-            found[part].append(figures(config, reference, images, true, maps, local))
+            *row, _ = figures(config, reference, images, true, loop, maps=maps, local=local[config.verification.mode])
+            found[part].append(row)
             print(f"{name:32} {part:36}", *(f"{value:7.3f}" for value in found[part][-1]), flush=True)
     print(f"\n{'mean over the cases, false loops in all':36}   top-1  R@100P  recall   false")
     for part, rows in found.items():
@@ -59,33 +64,38 @@ def main():
         print(f"{part:36} {np.nanmean(top):7.3f} {np.nanmean(full):7.3f} {np.nanmean(recall):7.3f} {false.sum():7.0f}")
 
 
-def figures(config, reference, images, true, maps, local):
+def figures(config, reference, images, true, loop, *, maps=None, local=None):
+    """Return top-1, recall at 100 % precision, recall, false loops, and the best score of a wrong candidate.
+
+    `maps` and `local` compute the features of an image where these are shared by several runs.
+    """
     detector = LoopDetector(config)
-    detector.method.features = lambda batch: [maps(image) for image in batch]
-    if detector.verifier is not None:
-        detector.verifier.features = local[config.verification.mode]
+    if maps is not None:
+        detector.method.features = lambda batch: [maps(image) for image in batch]
+    if local is not None:
+        detector.verifier.features = local
     if reference is not None:
         detector.set_reference(reference)
     decisions = [detector.add(image) for image in images]
-    loops = np.flatnonzero(true >= 0)
-    first = (0 if reference is not None else loops.min(initial=0)) + config.sequence.length - 1
-    frames = np.arange(len(images))
-    loop, full = true >= 0, frames >= first
+    first = config.sequence.length - 1 + (int(loop.argmax()) if reference is None else 0)
+    full = np.arange(len(images)) >= first
     match = np.array([-1 if one.match is None else one.match for one in decisions])
     score = np.array([-np.inf if one.score is None else one.score for one in decisions])
     accepted = np.array([one.accepted for one in decisions])
-    right = loop & (match >= 0) & (np.abs(match - true) <= TOLERANCE)
+    right = (match >= 0) & (np.abs(match - true) <= TOLERANCE)
     wrong = (match >= 0) & ~right & (full | ~loop)
+    worst = score[wrong].max(initial=0.0)
     if not loop.any():
-        return np.nan, np.nan, np.nan, (wrong & accepted).sum()
-    counted = right & full
+        return np.nan, np.nan, np.nan, (wrong & accepted).sum(), worst
+    counted = right & loop & full
     total = (loop & full).sum()
-    above = score > score[wrong].max(initial=-np.inf)
+    above = score > worst
     return (
         counted.sum() / total,
         (counted & above).sum() / total,
         (counted & accepted).sum() / total,
         (wrong & accepted).sum(),
+        worst,
     )
 
 

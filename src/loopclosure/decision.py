@@ -42,9 +42,9 @@ class Evidence:
     lasting : float
         Mean standing in these frames, see `Followed`.
     support : float
-        Geometric support in the frames of the sequence, see `Verification.support`; 0 without verification.
+        Geometric support on the way to the candidate, see `Witness`; 0 without verification.
     inliers : int or None
-        Matches that agree with one camera motion, in the best of these frames; None where none was looked at.
+        Matches that agree with one camera motion, in the best pair of frames; None where none was looked at.
     """
 
     match: int
@@ -68,13 +68,14 @@ class Evidence:
 
 _LONGEST_RUN = 60
 _SURE_RUN = 10  # frames from which on geometry counts in full: the like of a lorry is soon out of sight
-_SUPPORT_BY_CHANCE, _MOST_SUPPORT = 6.0, 20.0  # two lorries of one model reach 6, and so do two zebra crossings
+_SUPPORT_BY_CHANCE, _MOST_SUPPORT = 4.0, 20.0  # two lorries of one model come near to 4, and two zebra crossings
+_CONFIRMED = 8.0  # a place that local features tell well reaches that
 # Fitted by `python benchmarks/calibration.py`, which prints them and what they come to on places that were left out.
-_WEIGHTS = 0.862, 0.097, 1.030, 2.452
-_CONSTANT = -7.120
+_WEIGHTS = 0.676, 0.067, 1.115, 3.873
+_CONSTANT = -5.540
 _FALSE_PER_1000 = 12.0  # false loops among 1000 frames that no loop is in, at even odds
 _LOOKS = 3  # candidates of a frame, at most, that are verified
-_WORTH_A_LOOK = -6.0  # log-odds; below, geometry would have to be surer than it ever is by itself
+_WORTH_A_LOOK = -4.7  # log-odds; below, geometry would have to be surer than it ever is by itself
 
 
 def features_of(evidence: Evidence) -> tuple[float, ...]:
@@ -207,7 +208,7 @@ class Judge:
             return Reason.INCONSISTENT
         if self._witness is None:
             return Reason.BELOW_THRESHOLD
-        confirmed = replace(best, support=best.support + self._witness.bar)
+        confirmed = replace(best, support=max(best.support, _CONFIRMED))
         return Reason.NOT_VERIFIED if confirmed.probability >= self.threshold else Reason.BELOW_THRESHOLD
 
     def _why_none(self, query: int) -> Reason:

@@ -1,4 +1,4 @@
-"""Verification along a sequence: several pairs of frames that agree count more than one."""
+"""Verification along the way: nearly all pairs of frames must agree, not one or two of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import numpy as np
 
 from loopclosure.verification.views import Views
 
-_SLACK, _SLACK_A_FRAME = 2.0, 0.5  # frames by which two drives may differ in pace and still be on one track
+_REMEMBERED = 2  # sequences: a zebra crossing, or the like of a lorry, is sooner out of sight
+_AGREE = 0.85  # share of the looks in this time that are asked to agree
+_SLACK, _SLACK_A_FRAME, _MOST_SLACK = 2.0, 0.5, 7.0  # frames by which two drives on one track may differ in pace
 
 
 class Heard(NamedTuple):
@@ -18,7 +20,8 @@ class Heard(NamedTuple):
     Attributes
     ----------
     support : float
-        Mean of the two best supports (`Verification.support`) on the way to the candidate; 0 where there is none.
+        Mean support (`Verification.support`) of the looks on the way to the candidate, the worst ones left out; a look
+        that was not taken counts as 0.
     inliers : int or None
         Of the best one; None where no pair was looked at.
     """
@@ -35,23 +38,20 @@ class Witness:
     drive, places : Views
         Of the frames that come in, and of the map; the same object in one stream.
     length : int
-        Frames for which a verification counts.
+        Frames in a sequence.
     both_directions : bool
         Whether a place may also be driven through the other way.
     """
 
     def __init__(self, drive: Views, places: Views, *, length: int, both_directions: bool = False) -> None:
-        self._drive, self._places, self._length, self._both = drive, places, length, both_directions
+        self._drive, self._places, self._both = drive, places, both_directions
+        self._memory = _REMEMBERED * length
+        self._asked = max(round(_AGREE * self._memory / drive.every), 1)
         self._seen = np.zeros((0, 4))  # query, match, support, inliers
-
-    @property
-    def bar(self) -> float:
-        """Support of a pair that is verified by itself."""
-        return self._drive.verifier.least_support
 
     def hear(self, query: int, matches: Sequence[int], *, look_at: Sequence[int]) -> list[Heard]:
         """Return what is known of each candidate of a frame, after a look at some of them if the frame has a view."""
-        self._seen = self._seen[self._seen[:, 0] > query - self._length]
+        self._seen = self._seen[self._seen[:, 0] > query - self._memory]
         if self._drive.wanted(query) and len(self._places) and look_at:
             self._look(query, look_at)
         age = query - self._seen[:, 0]
@@ -66,11 +66,11 @@ class Witness:
 
     def _on_the_way(self, moved: np.ndarray, age: np.ndarray) -> Heard:
         off = np.abs(np.abs(moved) - age if self._both else moved - age)
-        near = self._seen[off <= _SLACK + _SLACK_A_FRAME * age]
+        near = self._seen[off <= np.minimum(_SLACK + _SLACK_A_FRAME * age, _MOST_SLACK)]
         if not len(near):
             return Heard(0.0, None)
-        best = near[np.argsort(-near[:, 2], kind="stable")[:2]]
-        return Heard(float(best[:, 2].mean()), int(best[0, 3]))
+        best = near[np.argsort(-near[:, 2], kind="stable")[: self._asked]]
+        return Heard(float(best[:, 2].sum()) / self._asked, int(best[0, 3]))
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the state, for `loopclosure.store`."""

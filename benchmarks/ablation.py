@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from calibration import TOLERANCE, Remembered, cases
+from calibration import TOLERANCE, WRONG, Remembered, cases
 
 from loopclosure import Config, LoopDetector
 from loopclosure.verification import Verifier
@@ -72,10 +72,10 @@ def figures(config, reference, images, true, loop, *, maps=None, local=None):
     detector = LoopDetector(config)
     if maps is not None:
         detector.method.features = lambda batch: [maps(image) for image in batch]
-    if local is not None:
-        detector.verifier.features = local
+    _verify_by(local, detector)
     if reference is not None:
         detector.set_reference(reference)
+        _verify_by(local, detector)
     decisions = [detector.add(image) for image in images]
     first = config.sequence.length - 1 + (int(loop.argmax()) if reference is None else 0)
     full = np.arange(len(images)) >= first
@@ -83,7 +83,7 @@ def figures(config, reference, images, true, loop, *, maps=None, local=None):
     score = np.array([-np.inf if one.score is None else one.score for one in decisions])
     accepted = np.array([one.accepted for one in decisions])
     right = (match >= 0) & (np.abs(match - true) <= TOLERANCE)
-    wrong = (match >= 0) & ~right & (full | ~loop)
+    wrong = (match >= 0) & ~right & (full | ~loop) & (loop | (np.abs(match - true) > WRONG))
     worst = score[wrong].max(initial=0.0)
     if not loop.any():
         return np.nan, np.nan, np.nan, (wrong & accepted).sum(), worst
@@ -97,6 +97,11 @@ def figures(config, reference, images, true, loop, *, maps=None, local=None):
         (wrong & accepted).sum(),
         worst,
     )
+
+
+def _verify_by(local, detector):
+    if local is not None and detector.verifier is not None:
+        detector.verifier.features = local
 
 
 if __name__ == "__main__":

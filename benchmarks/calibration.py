@@ -155,7 +155,7 @@ def evidence(case, name, reference, images, true, loop, length, maps, local):
 def label(rows):
     """1 for a loop, 0 for none, -1 for what is neither: near misses, and windows that reach over the seam."""
     off, loop, full = rows[:, 4], rows[:, 5] > 0, rows[:, 6] > 0
-    return np.where(loop & ~full, -1, np.where(off <= RIGHT, 1, np.where(off > WRONG, 0, -1)))
+    return np.where(loop & full & (off <= RIGHT), 1, np.where((full | ~loop) & (off > WRONG), 0, -1))
 
 
 def fit(rows):
@@ -170,16 +170,17 @@ def fit(rows):
 
 
 def judge(rows, weights, constant):
-    """Return for each frame that has a candidate: log-odds of the best, whether it is right, loop, full."""
+    """Return for each frame that has a candidate: log-odds of the best, whether it is right, far off, loop, full."""
     odds = rows[:, len(COLUMNS) :] @ weights + constant
     order = np.lexsort((-odds, rows[:, 2]))
     best = order[np.r_[True, np.diff(rows[order, 2]) > 0]]
-    return odds[best], rows[best, 4] <= TOLERANCE, rows[best, 5] > 0, rows[best, 6] > 0
+    off = rows[best, 4]
+    return odds[best], off <= TOLERANCE, off > WRONG, rows[best, 5] > 0, rows[best, 6] > 0
 
 
 def figures(rows, weights, constant, bars):
-    odds, right, loop, full = judge(rows, weights, constant)
-    counted, wrong = loop & full, ~right & (full | ~loop)
+    odds, right, far, loop, full = judge(rows, weights, constant)
+    counted, wrong = loop & full, ~right & (full | ~loop) & (loop | far)
     total = max(counted.sum(), 1)
     worst = odds[wrong].max(initial=-np.inf)
     accepted = [((counted & right & (odds >= bar)).sum() / total, (wrong & (odds >= bar)).sum()) for bar in bars]

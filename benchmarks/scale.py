@@ -3,11 +3,11 @@
     python benchmarks/scale.py [--places 1000000] [--streets 8] [--picture docs/images/scale.png] [--first-looks]
     python benchmarks/scale.py --detector [--places 200000] [--streets 8]
 
-Where the descriptors come from: simulated streets, each driven twice, go through the embedded network, KL compression,
-NetVLAD and the whitening KL transform behind it (64 numbers). Every further street is made of two of these, mixed 0.85
-to 0.5: one whose whitened components change sign at random, and one that 50 neighbouring streets share. A change of
-signs keeps all similarities within a street as they were measured and the covariance white; the shared part makes
-streets of one quarter look alike. The map holds first laps, queries are second laps.
+Where the descriptors come from: simulated streets, each driven twice, go through the embedded network, NetVLAD beside
+the layout, and the whitening KL transform behind them (128 numbers). Every further street is made of two of these,
+mixed 0.85 to 0.5: one whose whitened components change sign at random, and one that 50 neighbouring streets share. A
+change of signs keeps all similarities within a street as they were measured and the covariance white; the shared part
+makes streets of one quarter look alike. The map holds first laps, queries are second laps.
 
 One map grows through all sizes, and every figure is of that one run: medians of 200 queries, of the last 5,000 adds.
 Exact answers come from all cosines. ``same_best`` is the share of frames whose best sequence on the shortlist is the
@@ -28,7 +28,6 @@ import numpy as np
 
 from loopclosure.aggregation.centring import centre_traverse
 from loopclosure.aggregation.netvlad import unit
-from loopclosure.aggregation.reduction import Reduction
 from loopclosure.config import Config
 from loopclosure.detect import LoopDetector
 from loopclosure.evaluation.machine import describe_machine
@@ -40,12 +39,12 @@ from loopclosure.methods import build_method
 from loopclosure.report.style import line_styles, new_figure
 
 SIZES = (10_000, 30_000, 100_000, 300_000, 1_000_000)
-COMPONENTS, LAP, QUARTER = 64, 200, 50
+NUMBERS, LAP, QUARTER = 128, 200, 50
 QUERIES, ADDS, NEIGHBOURS, LENGTH = 200, 5_000, 10, 10
 
 
 def measured_laps(streets):
-    """Descriptors of simulated streets, float32 (streets, 2, LAP, COMPONENTS)."""
+    """Descriptors of simulated streets, float32 (streets, 2, LAP, NUMBERS)."""
     method, features = build_method(Config()), []
     for seed in range(streets):
         images = (frame.image for frame in Drive(SimulationSettings(frames=2 * LAP, seed=seed)))
@@ -54,19 +53,18 @@ def measured_laps(streets):
     method.fit([map_.astype(np.float32) for map_ in features[:: max(len(features) // 500, 1)]])
     described = np.stack([method.describe([map_.astype(np.float32)]) for map_ in features])
     centred = np.concatenate([centre_traverse(lap, window=60)[0] for lap in np.split(described, 2 * streets)])
-    reduction = Reduction(COMPONENTS).fit(centred)
-    return unit(centred @ reduction.basis_.T).reshape(streets, 2, LAP, COMPONENTS)
+    return np.stack([method.reduce(one) for one in centred]).reshape(streets, 2, LAP, NUMBERS)
 
 
 def street(laps, number, *, lap):
-    """Descriptors of one lap of a street, float32 (LAP, COMPONENTS)."""
+    """Descriptors of one lap of a street, float32 (LAP, NUMBERS)."""
     own, shared = (signed(laps, seed)[lap] for seed in (2 * number, 2 * (number // QUARTER) + 1))
     return unit(0.85 * own + 0.5 * shared)
 
 
 def signed(laps, seed):
     rng = np.random.default_rng(seed)
-    return laps[rng.integers(len(laps))] * rng.choice(np.float32([-1, 1]), COMPONENTS)
+    return laps[rng.integers(len(laps))] * rng.choice(np.float32([-1, 1]), NUMBERS)
 
 
 def resident():
@@ -158,13 +156,13 @@ def first_looks(laps, count):
     rows = np.concatenate([street(laps, number, lap=0) for number in range(count // LAP)])
     queries, inner = queries_of(rows, laps), faiss.METRIC_INNER_PRODUCT
     exact = [np.argpartition(-(rows @ query), NEIGHBOURS)[:NEIGHBOURS] for query in queries]
-    codes = faiss.IndexPQFastScan(COMPONENTS, COMPONENTS // 2, 4, inner)
+    codes = faiss.IndexPQFastScan(NUMBERS, NUMBERS // 2, 4, inner)
     clusters = int(4 * np.sqrt(count))
-    kmeans = faiss.Kmeans(COMPONENTS, clusters, niter=10, spherical=True, max_points_per_centroid=64, seed=0)
+    kmeans = faiss.Kmeans(NUMBERS, clusters, niter=10, spherical=True, max_points_per_centroid=64, seed=0)
     kmeans.train(rows)
-    nearest = faiss.IndexFlatIP(COMPONENTS)
+    nearest = faiss.IndexFlatIP(NUMBERS)
     nearest.add(kmeans.centroids)
-    lists = faiss.IndexIVFPQFastScan(nearest, COMPONENTS, clusters, COMPONENTS // 2, 4, inner)
+    lists = faiss.IndexIVFPQFastScan(nearest, NUMBERS, clusters, NUMBERS // 2, 4, inner)
     lists.by_residual = False
     looks = [(f"1/{share} of {clusters} lists", lists, clusters // share) for share in (16, 8, 4, 2)]
     for index in (codes, lists):

@@ -71,8 +71,8 @@ _SURE_RUN = 10  # frames from which on geometry counts in full: the like of a lo
 _SUPPORT_BY_CHANCE, _MOST_SUPPORT = 4.0, 20.0  # two lorries of one model come near to 4, and two zebra crossings
 _CONFIRMED = 8.0  # a place that local features tell well reaches that
 # Fitted by `python benchmarks/calibration.py`, which prints them and what they come to on places that were left out.
-_WEIGHTS = 0.676, 0.067, 1.115, 3.873
-_CONSTANT = -5.540
+_WEIGHTS = 0.737, 0.070, 1.037, 2.509
+_CONSTANT = -5.609
 _FALSE_PER_1000 = 12.0  # false loops among 1000 frames that no loop is in, at even odds
 _LOOKS = 3  # candidates of a frame, at most, that are verified
 _WORTH_A_LOOK = -4.7  # log-odds; below, geometry would have to be surer than it ever is by itself
@@ -138,12 +138,7 @@ class Judge:
         self._consistency = Consistency(both_directions=config.sequence.direction == "both")
         self._witness: Witness | None = None
         if self.views is not None and self.places is not None:
-            self._witness = Witness(
-                self.views,
-                self.places,
-                length=config.sequence.length,
-                both_directions=config.sequence.direction == "both",
-            )
+            self._witness = Witness(self.views, self.places, both_directions=config.sequence.direction == "both")
 
     @property
     def threshold(self) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from loopclosure.aggregation.netvlad import unit
 
 _USUAL = 0.75  # quantile of the changes in a view that counts in full: much of it may ride along
-_SLIGHT = 0.1  # change, 1 - cosine, that noise makes too: a robot that stands still must not magnify it
+_SLIGHT = 0.1  # change, 1 - cosine, that noise makes too; where the view changes no more the robot stands, or nearly
 _LEAST = 0.1  # weight
 
 
@@ -26,7 +26,8 @@ def change(newest: np.ndarray, before: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray of float32, shape (h, w)
-        Weights, 0.1 to 1.
+        Weights, 0.1 to 1. The less the whole view changes, the nearer all of them are to 1: when the robot stands, what
+        changes are passers-by.
 
     Examples
     --------
@@ -36,5 +37,7 @@ def change(newest: np.ndarray, before: np.ndarray) -> np.ndarray:
     array([[0.1, 0.1, 1. , 1. ]], dtype=float32)
     """
     changes = 1 - (unit(newest) * unit(before)).sum(axis=-1)
-    weights: np.ndarray = np.clip(changes / max(np.quantile(changes, _USUAL), _SLIGHT), _LEAST, 1).astype(np.float32)
-    return weights
+    usual = max(float(np.quantile(changes, _USUAL)), 1e-30)
+    moving = min(usual / _SLIGHT, 1)
+    weights: np.ndarray = 1 - moving * (1 - np.clip(changes / usual, _LEAST, 1))
+    return weights.astype(np.float32)

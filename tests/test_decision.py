@@ -84,7 +84,7 @@ def test_the_reason_names_what_is_missing(decided):
         enough = {
             Reason.ACCEPTED: best,
             Reason.INCONSISTENT: replace(best, run=1000),
-            Reason.NOT_VERIFIED: replace(best, support=max(best.support, 8)),
+            Reason.NOT_VERIFIED: replace(best, support=max(best.support, judging._CONFIRMED)),
             Reason.BELOW_THRESHOLD: None,
         }
         first = next(reason for reason, one in enough.items() if one is None or one.probability >= least)

@@ -97,6 +97,7 @@ def test_scores_are_those_of_the_whole_comparison_where_there_are_any(both_ways)
 
 
 def test_what_speaks_for_a_place_is_the_same(both_ways):
+    """From the first whole sequence on; before, candidates are chance, and stand now above, now below zero."""
     (_, mine), (_, everything) = both_ways
     pairs = [
         (one, two)

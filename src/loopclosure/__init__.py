@@ -5,9 +5,11 @@ The data flow is the folder list::
     images/         folders, text files of paths, videos, the simulator      -> uint8 RGB
     features/       backbones                                                -> feature maps
     compression/    Karhunen-Loeve transform                                 -> smaller feature maps
-    aggregation/    NetVLAD, running mean                                    -> one descriptor a frame
+    aggregation/    NetVLAD, layout, running mean                            -> one descriptor a frame
     matching/       map, sequences                                           -> scores of candidates
-    detect.py       LoopDetector: all of it, one frame at a time             -> decisions
+    verification/   local features, camera motion                            -> support of candidates
+    decision.py     the odds of a loop                                       -> decisions
+    detect.py       LoopDetector: all of it, one frame at a time
     evaluation/     truth and metrics        report/  pictures and pages     cli/  the commands
 
 `methods` is the table of systems that can be run, `config` holds every setting, `records` what travels between

@@ -98,7 +98,7 @@ class Aggregation(Section):
         description="numbers that NetVLAD, and the layout, are each reduced to, whitened (needs centring); 0 = all of "
         "NetVLAD are kept",
     )
-    layout: float = Field(
+    layout_weight: float = Field(
         0.7, ge=0, le=10, description="weight of the layout of the view beside NetVLAD, both whitened; 0 = none"
     )
     change_over: int = Field(
@@ -110,9 +110,14 @@ class Aggregation(Section):
     )
 
     @property
-    def weights(self) -> tuple[float, ...]:
+    def whitened(self) -> bool:
+        """Whether descriptors are reduced to whitened numbers: only what is centred can be."""
+        return bool(self.centre_window and self.components)
+
+    @property
+    def part_weights(self) -> tuple[float, ...]:
         """Of NetVLAD, and of the layout where that stands beside it."""
-        return (1.0, self.layout) if self.centre_window and self.components and self.layout else (1.0,)
+        return (1.0, self.layout_weight) if self.whitened and self.layout_weight else (1.0,)
 
 
 class Learning(Section):
@@ -193,7 +198,7 @@ class Verification(Section):
     """Whether local features confirm a loop."""
 
     mode: Literal["none", "fast", "strict"] = Field(
-        "fast", description="'strict' takes twice the local features of 'fast' and lets less that is false pass"
+        "fast", description="'strict' takes twice the local features of 'fast', and longer"
     )
     every: int = Field(3, ge=1, le=100, description="a small picture is kept of every so many frames")
 

@@ -40,7 +40,7 @@ class Evidence:
     run : int
         Frames over which the candidate has moved on with the robot, of those in which it stood out.
     lasting : float
-        Mean standing in these frames, see `Followed`.
+        Mean standing while it moved on, see `Followed`.
     support : float
         Geometric support on the way to the candidate, see `Witness`; 0 without verification.
     inliers : int or None
@@ -68,14 +68,14 @@ class Evidence:
 
 _LONGEST_RUN = 60
 _SURE_RUN = 10  # frames from which on geometry counts in full: the like of a lorry is soon out of sight
-_SUPPORT_BY_CHANCE, _MOST_SUPPORT = 4.0, 20.0  # two lorries of one model come near to 4, and two zebra crossings
-_CONFIRMED = 8.0  # a place that local features tell well reaches that
+_SUPPORT_BY_CHANCE, _MOST_SUPPORT = 4.0, 20.0  # two lorries of one model come near to 4, as two zebra crossings do
+_CONFIRMED = 8.0  # support; by day a place that is seen again reaches more than that
 # Fitted by `python benchmarks/calibration.py`, which prints them and what they come to on places that were left out.
 _WEIGHTS = 0.737, 0.070, 1.037, 2.509
 _CONSTANT = -5.609
 _FALSE_PER_1000 = 12.0  # false loops among 1000 frames that no loop is in, at even odds
 _LOOKS = 3  # candidates of a frame, at most, that are verified
-_WORTH_A_LOOK = -4.7  # log-odds; below, geometry would have to be surer than it ever is by itself
+_WORTH_A_LOOK = -4.7  # log-odds; below, not one candidate in a hundred is a loop, and a look costs a millisecond
 
 
 def features_of(evidence: Evidence) -> tuple[float, ...]:

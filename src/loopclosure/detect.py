@@ -247,7 +247,7 @@ class LoopDetector:
         """
         seen = self._fit_on(images, source=source, progress=progress)
         self._warm_up = None
-        self._mean = self._mean_of([view.features for view in seen.values() if view.features is not None])
+        self._mean = self._mean_of([view.features for view in seen.values() if view.features is not None], apart=True)
         self._start(self._new_traverse(prior=self._mean))
 
     def _new_traverse(self, *, reference: PlaceMap | None = None, prior: np.ndarray | None = None) -> Traverse:
@@ -264,8 +264,10 @@ class LoopDetector:
         self._judge = Judge(self.config, self.method, one_stream=traverse.one_stream, reference=reference)
         self._perception = Perception(self.method, self._judge.views, self._clock)
 
-    def _mean_of(self, features: list[np.ndarray]) -> np.ndarray | None:
-        recent: deque[np.ndarray] = deque(maxlen=self.method.window)
+    def _mean_of(self, features: list[np.ndarray], *, apart: bool = False) -> np.ndarray | None:
+        """Return the mean descriptor of frames that follow each other, or lie far apart."""
+        alone = apart and not self.method.whole_sequences
+        recent: deque[np.ndarray] = deque(maxlen=1 if alone else self.method.window)
         described = [describe(self.method, item, recent) for item in features]
         return describe_traverse(self.method, self.config, described)[1]
 
@@ -292,10 +294,11 @@ class LoopDetector:
         """Fit the method on evenly spaced frames and return what was seen in these, by index."""
         images = self._perception.as_needed(images)
         learning = self.config.learning
-        first = self._perception.look(0, next((image for image in images if image is not None), None))
-        if first.features is None:
+        at, first = next(((i, image) for i, image in enumerate(images) if image is not None), (0, None))
+        looked = self._perception.look(at, first)
+        if looked.features is None:
             raise FitError(f"none of the {len(images)} frames of the {source} can be read: nothing to fit on")
-        most = max(2, min(learning.fit_frames, int(learning.max_kept_mb * 1e6 / first.features.nbytes)))
+        most = max(2, min(learning.fit_frames, int(learning.max_kept_mb * 1e6 / looked.features.nbytes)))
         chosen = _evenly_spaced(len(images), most)
         seen = {}
         for index, view in self._perception.look_at_some(images, chosen):
@@ -303,7 +306,7 @@ class LoopDetector:
                 seen[index] = view
             if progress:
                 progress(index + 1, len(images))
-        seen = seen or {0: first}
+        seen = seen or {at: looked}
         with self._clock("learn"):
             self.method.fit([view.features for view in seen.values() if view.features is not None])
         self.learned_on = [f"{len(seen)} of {len(images)} frames of the {source}"]

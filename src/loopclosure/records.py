@@ -25,7 +25,7 @@ class Reason(str, Enum):
     SEQUENCE_TOO_SHORT = "sequence_too_short"
     """Fewer frames than one sequence stand behind this frame, or behind every candidate."""
     NOT_VERIFIED = "not_verified"
-    """It would be a loop, did one camera motion explain both views."""
+    """It would be a loop, did one camera motion explain the views along the way."""
     UNREADABLE = "unreadable"
     """The image could not be decoded and ``on_error`` is ``skip``."""
 
@@ -49,7 +49,8 @@ class Decision:
     accepted : bool
         Whether the pair is reported as a loop.
     inliers : int or None
-        Matches that agree with one camera motion; None where geometry was not asked.
+        Matches that agree with one camera motion, in the best pair of frames along the way to the match; None where
+        geometry was not asked.
     reason : Reason
         Why.
     """

@@ -27,6 +27,18 @@ EXPORTED = "bundle.json"
 EXPORTED_FILES = ("network.xml", "network.bin", "network.onnx", "network.json")
 _CARRIED = {TRAINED: (TRAINED,), EXPORTED: (*EXPORTED_FILES, EXPORTED)}
 MAX_HEADER_BYTES = 1 << 20
+_FREE = (
+    "images.",
+    "learning.",
+    "training.",
+    "matching.",
+    "sequence.",
+    "decision.",
+    "verification.",
+    "aggregation.centre",
+    "features.backend",
+)
+"""Settings that a model was not fitted for, by how their names begin."""
 
 
 def save_arrays(
@@ -149,10 +161,19 @@ def agreed_config(
 ) -> Config:
     """Return the configuration, which must not contradict a model on anything that the model was fitted for.
 
+    Parameters
+    ----------
+    config : Config, optional
+        What is wanted; by default what the model was fitted with.
+    header : mapping, optional
+        Of the model; without one everything can be wanted.
+    folder : path, optional
+        Where the model is, for its own network and for what an error says.
+
     Raises
     ------
     ModelError
-        If it does.
+        If it contradicts the model.
     """
     if header is None:
         return config or Config()
@@ -160,18 +181,7 @@ def agreed_config(
     if config is None:
         return fitted
     wanted, found = config.flat(), fitted.flat()
-    free = (
-        "images.",
-        "learning.",
-        "training.",
-        "matching.",
-        "sequence.",
-        "decision.",
-        "verification.",
-        "aggregation.centre",
-        "features.backend",
-    )
-    binding = [name for name in wanted if not name.startswith(free)]
+    binding = [name for name in wanted if not name.startswith(_FREE)]
     if fitted.compression.reading == "sequence":
         binding.append("sequence.length")
     for name in binding:
@@ -180,4 +190,9 @@ def agreed_config(
                 f"the model was fitted with {name} = {found[name]}, wanted {wanted[name]}; "
                 "leave that setting out or fit again with it"
             )
+    if config.aggregation.whitened != fitted.aggregation.whitened:
+        raise ModelError(
+            f"the model was fitted with aggregation.centre_window = {fitted.aggregation.centre_window}, wanted "
+            f"{config.aggregation.centre_window}: descriptors are whitened in one of the two only; fit again with it"
+        )
     return config

@@ -73,3 +73,11 @@ def test_state_comes_back():
     again = RunningMean.from_arrays(running.to_arrays())
     for descriptor in descriptors[60:]:
         np.testing.assert_allclose(again.centre(descriptor), running.centre(descriptor), atol=1e-6)
+
+
+def test_a_frame_that_is_all_that_recent_frames_share_says_nothing():
+    """What is left of it are rounding errors, which scaled to length 1 would look like a place."""
+    descriptor = unit(np.random.default_rng(5).normal(size=50).astype(np.float32))
+    mean = RunningMean(30)
+    assert not any(mean.centre(descriptor * np.float32(1 + 1e-6 * i)).any() for i in range(40))
+    assert not centre_traverse(np.tile(descriptor, (9, 1)), window=5)[0].any()

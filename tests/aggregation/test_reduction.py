@@ -62,6 +62,12 @@ def test_parts_are_whitened_by_themselves_and_weighed(descriptors):
     np.testing.assert_array_equal(again.transform(scaled[3]), both.transform(scaled[3]))
 
 
+@pytest.mark.parametrize("sizes", [(20, 20), (120,), (100, 20, 0)])
+def test_sizes_that_do_not_fit_are_refused(descriptors, sizes):
+    with pytest.raises(FitError, match="wanted 2 that make 120"):
+        Reduction(8, weights=(1.0, 0.5)).fit(descriptors, sizes=sizes)
+
+
 def test_blank_stays_blank_and_state_comes_back(descriptors):
     reduction = Reduction(8).fit(descriptors)
     again = Reduction.from_arrays(reduction.to_arrays())

@@ -18,6 +18,7 @@ from loopclosure.images.sequence import ImageSequence
 from loopclosure.images.simulator import SimulationSettings, simulate
 from loopclosure.report.explain import explain_images, explain_run
 from loopclosure.report.heatmaps import DescriptorNetwork, Explainer, View, cluster_shares, cosine, matches
+from loopclosure.report.means import window_start
 from loopclosure.report.overlays import heat_overlay
 from loopclosure.runs import detect_loops
 
@@ -269,3 +270,10 @@ def test_the_missing_package_names_its_extra(method, monkeypatch):
     monkeypatch.setitem(sys.modules, "pytorch_grad_cam", None)
     with pytest.raises(ConfigError, match=r"pip install 'loopclosure\[explain\]'"):
         Explainer(method)
+
+
+def test_unreadable_frames_do_not_count_among_those_before():
+    images = [0, 1, 2, 3, None, None, 6, 7, 8]
+    assert [window_start(images, frame, 6) for frame in (0, 2, 6, 7, 8)] == [0, 0, 0, 0, 1]
+    assert [window_start(images, frame, 1) for frame in (0, 8)] == [0, 8]
+    assert window_start([None, None, 2], 2, 6) == 2

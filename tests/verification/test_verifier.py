@@ -9,7 +9,7 @@ from textures import texture
 
 from loopclosure.errors import ConfigError, ImageError
 from loopclosure.images.simulator import Camera, Drive, SimulationSettings
-from loopclosure.verification import GRID, LocalFeatures, Verification, Verifier, cells
+from loopclosure.verification import LocalFeatures, Verifier, cells
 from loopclosure.verification.local_features import compact
 from loopclosure.verification.matching import mutual_matches
 
@@ -131,19 +131,6 @@ def test_simulated_loops_are_verified_with_their_motion_and_other_streets_are_no
     assert verified >= 3
     assert np.median(turned) < 0.5
     assert np.median(aside) < 10
-
-
-def test_frames_that_follow_each_other_decide_together():
-    none = np.zeros((0, 2), np.float32)
-    verifier = Verifier("fast")
-
-    def found(support):
-        return Verification(False, 10, support / (GRID[0] * GRID[1]), 10, "fundamental", none, none)
-
-    least = verifier.least_support
-    assert verifier.agree([found(least + 3), found(least - 2), found(least + 1)])
-    assert not verifier.agree([found(least + 1), found(least - 2), found(least)])
-    assert not verifier.agree([])
 
 
 @KINDS

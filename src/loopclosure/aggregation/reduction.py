@@ -59,11 +59,16 @@ class Reduction:
         Raises
         ------
         FitError
-            If there are fewer.
+            If there are fewer, or the sizes do not fit.
         """
         if len(descriptors) < 3:
             raise FitError(f"{len(descriptors)} descriptors, wanted at least 3 to learn what they have in common")
-        edges = np.cumsum(sizes or (descriptors.shape[1],))[:-1]
+        sizes = sizes or (descriptors.shape[1],)
+        if sum(sizes) != descriptors.shape[1] or len(sizes) != len(self.weights):
+            raise FitError(
+                f"parts of {list(sizes)} numbers, wanted {len(self.weights)} that make {descriptors.shape[1]} together"
+            )
+        edges = np.cumsum(sizes)[:-1]
         fitted = [self._whitening(part) for part in np.split(descriptors, edges, axis=1)]
         self.bases_ = [basis for basis, _ in fitted]
         self.energies_ = [energies for _, energies in fitted]
@@ -88,8 +93,8 @@ class Reduction:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return what was learned, for `loopclosure.store`."""
-        pairs = enumerate(zip(self.bases_, self.energies_, strict=True))
-        return {name: array for i, (b, e) in pairs for name, array in ((f"basis{i}", b), (f"energies{i}", e))}
+        bases = {f"basis{i}": basis for i, basis in enumerate(self.bases_)}
+        return bases | {f"energies{i}": energies for i, energies in enumerate(self.energies_)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray], *, weights: Sequence[float] = (1.0,)) -> Reduction:

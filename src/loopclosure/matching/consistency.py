@@ -19,8 +19,8 @@ class Followed(NamedTuple):
     run : int
         Frames over which it has moved on steadily, those alone in which something was said for it.
     lasting : float
-        Mean of what was said for it in each of these frames, older ones counting less; frames before the run count as
-        zero.
+        Mean of what was said for it while it moved on, in the other frames too, older ones counting less; what came
+        before counts as zero.
     """
 
     run: int

@@ -61,7 +61,7 @@ class Method(ABC):
     centred : bool
         Whether descriptors are vectors from which the running mean of the traverse is taken out.
     window : int
-        Frames whose features one descriptor is made of.
+        Frames whose features `describe` is given: it describes the newest and sees by the others what has changed.
     whole_sequences : bool
         Whether one descriptor stands for all frames of a sequence.
     threshold : float

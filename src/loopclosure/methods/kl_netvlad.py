@@ -73,10 +73,10 @@ class KLNetVLAD(Method):
         self._netvlad = NetVLAD(config.aggregation.clusters, seed=config.learning.seed)
         self._reduction: Reduction | None = None
         self._components = config.aggregation.components if self._reading in ("channel", "none") else 0
-        if not config.aggregation.centre_window:
+        if not config.aggregation.whitened:
             self._components = 0
         self.calibrated = bool(self._components)
-        self._weights = config.aggregation.weights if self._components else (1.0,)
+        self._weights = config.aggregation.part_weights if self._components else (1.0,)
         self._blank: np.ndarray | None = None
         if self._reading == "sequence":
             self.window, self.whole_sequences = config.sequence.length, True
@@ -182,7 +182,7 @@ class KLNetVLAD(Method):
 
     def new_map(self, *, exclude_recent: int) -> VectorMap:  # noqa: ARG002  (all pairs cost the same here)
         """Return an empty map for the descriptors; whitened ones have an index where they are many."""
-        if 0 < self._components <= LONGEST:
+        if 0 < len(self._weights) * self._components <= LONGEST:
             return PlaceIndex(flat_up_to=self.config.matching.flat_up_to)
         return SetMap() if self._reading == "sequence" else VectorMap()
 

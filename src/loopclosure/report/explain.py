@@ -23,7 +23,7 @@ from loopclosure.images.decode import read_image
 from loopclosure.images.sequence import ImageSequence
 from loopclosure.perception import Frames
 from loopclosure.report.heatmaps import Explainer, View, check_explainable, cosine, matches
-from loopclosure.report.means import means_taken_out
+from loopclosure.report.means import means_taken_out, window_start
 from loopclosure.report.overlays import draw_clusters, draw_heat
 from loopclosure.report.pairs import Pair, spread
 from loopclosure.report.spectrum import kl_spectrum
@@ -105,7 +105,7 @@ def explain_run(
     for number, pair in enumerate(pairs):
         window = detector.method.window
         left, right = (
-            explainer.look(_frame(images, frame), mean[frame], before=_before(images, frame, window))
+            explainer.look(_frame(images, frame), mean[frame], before=images[window_start(images, frame, window)])
             for images, frame, mean in ((queries, pair.query, means[0]), (references or queries, pair.match, means[1]))
         )
         names = (f"query {pair.query}", f"match {pair.match}")
@@ -228,12 +228,6 @@ def _frame(images: Frames, position: int) -> np.ndarray:
     if image is None:
         raise ImageError(f"frame {position} of the run is no longer there or cannot be read")
     return image
-
-
-def _before(images: Frames, position: int, window: int) -> np.ndarray | None:
-    """Return the first readable frame of those that a descriptor is made of, if any stands before its own."""
-    earlier = (images[i] for i in range(max(position + 1 - window, 0), position))
-    return next((image for image in earlier if image is not None), None)
 
 
 def _draw(

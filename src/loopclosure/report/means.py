@@ -54,6 +54,16 @@ def means_taken_out(
     return _running_means(detector.method, queries, wanted, window, prior, progress), dict.fromkeys(matched, prior)
 
 
+def window_start(images: Frames, frame: int, window: int) -> int:
+    """Return the first of the last `window` readable frames up to this one: its descriptor is made of these."""
+    start, before = frame, frame
+    while before > 0 and window > 1:
+        before -= 1
+        if images[before] is not None:
+            start, window = before, window - 1
+    return start
+
+
 def _running_means(
     method: Method,
     images: Frames,
@@ -87,7 +97,7 @@ def _mean_of(method: Method, images: Frames, frames: range, progress: Callable[[
 def _described(method: Method, images: Frames, frames: range) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the descriptors of some frames, each described with those before it as in the drive."""
     recent: deque[np.ndarray] = deque(maxlen=method.window)
-    for i in range(max(frames.start + 1 - method.window, 0), frames.stop):
+    for i in range(window_start(images, frames.start, method.window), frames.stop):
         image = images[i]
         descriptor = describe(method, None if image is None else method.features([image])[0], recent)
         if i in frames:

@@ -256,12 +256,12 @@ class NetVLADTask:
         if self.kl is not None:
             arrays |= {f"kl.{name}": array for name, array in self.kl.to_arrays().items()}
         described = self.describe(self._members)
-        sizes, weights = [described.shape[1]], self._aggregation.weights
+        sizes, weights = [described.shape[1]], self._aggregation.part_weights
         if len(weights) > 1:
             described = np.hstack([described, self._layouts()])
             sizes.append(described.shape[1] - sizes[0])
         centred, mean = centre_traverse(described, window=1)
-        if self._aggregation.components:
+        if self._aggregation.whitened:
             reduction = Reduction(self._aggregation.components, weights=weights).fit(centred, sizes=sizes)
             arrays |= {f"reduction.{name}": array for name, array in reduction.to_arrays().items()}
         return arrays | ({} if mean is None else {"mean_of_fit": mean})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
@@ -48,7 +47,7 @@ class Effort(NamedTuple):
 MODES: dict[VerificationMode, Effort] = {"fast": Effort(500, 3.0), "strict": Effort(1000, 5.0)}
 """Chosen on walks, a corridor and simulated traffic together: two different places have a support of 0.6 by chance and
 up to 2.6 with like furniture. Where the same model of lorry fills half of both images it is up to 4.4, and 5.9 with the
-features of `fast`, which such a pair can deceive unless a sequence decides (`Verifier.agree`)."""
+features of `fast`, which such a pair can deceive unless the way to it decides (`Witness`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,19 +223,6 @@ class Verifier:
         moving = np.full(len(features), True)
         moving[found[still, 0]] = False
         return LocalFeatures(features.points[moving], features.descriptors[moving], features.size)
-
-    def agree(self, verifications: Sequence[Verification]) -> bool:
-        """Say whether frames that follow each other show one place, from what was found in each with its own match.
-
-        A sequence decides more surely than its last frame: the vehicles change, the place does not. Frames t, t - 3,
-        t - 6 against m, m - 3, m - 6 part true pairs from false ones clearly better than t and m alone.
-
-        Parameters
-        ----------
-        verifications : sequence of Verification
-            At least one.
-        """
-        return sum(found.support for found in verifications) >= self.least_support * len(verifications) > 0
 
     def _motion(self, found: Verification, side: int) -> Motion | None:
         if self.intrinsics is None:

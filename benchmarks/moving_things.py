@@ -46,6 +46,9 @@ METHODS = {
     "NetVLAD, no KL, centred": CENTRED,
     "KL 80%, NetVLAD, centred": CENTRED | {"compression.gamma": 0.8},
     "as shipped, not verified": {"verification.mode": "none"},
+    "the same, no layout": {"verification.mode": "none", "aggregation.layout_weight": 0},
+    "the same, what rides along counts": {"verification.mode": "none", "aggregation.change_over": 0},
+    "the same, neither": {"verification.mode": "none", "aggregation.layout_weight": 0, "aggregation.change_over": 0},
 }
 DRAWN = 9  # the first of them; more lines cannot be told apart
 DRIVES = {"sim, day": "day", "sim, day then dusk": "dusk"}

@@ -25,7 +25,7 @@ from loopclosure.verification import Verifier
 
 LENGTHS = 10, 5, 1
 RIGHT, WRONG, TOLERANCE = 3, 10, 2
-BARS = 1.0, 2.0, 3.0, 4.0, 4.4, 5.0
+BARS = 1.0, 2.0, 3.0, 3.5, 4.0, 4.37, 5.0  # 4.37: the default rate
 PAIRS = {
     "day": ("gardens_point/day_left", "gardens_point/day_right"),
     "night": ("gardens_point/day_right", "gardens_point/night_right"),
@@ -239,7 +239,8 @@ def report(names, groups, rows):
                 of = rows[(rows[:, 0] == case) & (rows[:, 1] == length)]
                 model = (weights, constant) if how == "fitted on all" else held[groups[case]]
                 top, full, accepted, loops = figures(of, *model, BARS)
-                totals.append((loops, top, full, accepted, len(np.unique(of[:, 2]))))
+                free = len(np.unique(of[of[:, 5] == 0, 2]))
+                totals.append((loops, top, full, accepted, len(np.unique(of[:, 2])), free))
                 cells = " ".join(f"{recall:6.2f} {false:4d}" for recall, false in accepted)
                 print(f"  {name:28} {f'{top:5.3f} {full:5.3f}' if loops else '          -'}  {cells}")
             with_loops = [total for total in totals if total[0]]
@@ -251,6 +252,9 @@ def report(names, groups, rows):
                 f"  {how:28} {np.mean([t[1] for t in with_loops]):5.3f} {np.mean([t[2] for t in with_loops]):5.3f}  "
                 f"{mean}  of {sum(t[4] for t in totals)} frames"
             )
+            free = sum(t[5] for t in totals)
+            odds = [1000 * sum(t[3][i][1] for t in totals) / free * (1 + np.exp(bar)) for i, bar in enumerate(BARS)]
+            print(f"  false loops in 1000 of {free} frames without a loop, to one at even odds:", *np.round(odds, 1))
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ def change(newest: np.ndarray, before: np.ndarray) -> np.ndarray:
     --------
     >>> before = np.ones((1, 4, 2), np.float32)
     >>> newest = before * np.array([[1, 1], [1, 1], [-1, 1], [-1, 1]], np.float32)
-    >>> change(newest, before)
+    >>> change(newest, before).round(3)
     array([[0.1, 0.1, 1. , 1. ]], dtype=float32)
     """
     changes = 1 - (unit(newest) * unit(before)).sum(axis=-1)

@@ -230,8 +230,7 @@ def draw(rows, path):
         (("rss_a_place", "process"), ("bytes_a_place", "vectors and codes")), line_styles(2), strict=True
     ):
         memory_axes.semilogx(count, [row[name] for row in rows], label=label, **style)
-    memory_axes.set(xlabel="places in the map", ylabel="bytes a place", ylim=(0, 650))
-    memory_axes.axhline(600, color="#5d6673", linewidth=0.8)
+    memory_axes.set(xlabel="places in the map", ylabel="bytes a place", ylim=(0, 800))
     memory_axes.legend()
     figure.savefig(path)
 

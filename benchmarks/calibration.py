@@ -4,7 +4,7 @@
 
 FOLDER holds `gardens_point` and `corridor`. Every case goes through `LoopDetector` with the default settings and
 sequences of 10, 5 and 1 frames; the evidence for each candidate is labelled by the truth (right within 3 frames, wrong
-beyond 10 or where there is no loop) and a logistic model is fitted to that of the longest sequences, every case
+beyond 10, neither in between) and a logistic model is fitted to that of the longest sequences, every case
 weighing the same. Then each group of places is left out in turn. With `--rows` the evidence is kept in a file, or taken
 from files that exist: `--rows a.npz b.npz` joins the cases of two runs.
 """

@@ -62,7 +62,7 @@ def in_batches(items: Iterable[T], size: int) -> Iterator[list[T]]:
             if len(batch) == size:
                 yield batch
                 batch = []
-    except Exception:
+    except Exception:  # nothing is swallowed: what was read before the error is handed on, then it goes on its way
         if batch:
             yield batch
         raise

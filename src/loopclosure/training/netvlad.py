@@ -255,25 +255,24 @@ class NetVLADTask:
         arrays = {f"netvlad.{name}": array for name, array in layer.to_arrays().items()}
         if self.kl is not None:
             arrays |= {f"kl.{name}": array for name, array in self.kl.to_arrays().items()}
-        described = self.describe(self._members)
-        sizes, weights = [described.shape[1]], self._aggregation.part_weights
-        if len(weights) > 1:
-            described = np.hstack([described, self._layouts()])
-            sizes.append(described.shape[1] - sizes[0])
-        centred, mean = centre_traverse(described, window=1)
+        parts, weights = self._parts(), self._aggregation.part_weights
+        centred, mean = centre_traverse(np.hstack(parts), window=1)
         if self._aggregation.whitened:
+            sizes = [part.shape[1] for part in parts]
             reduction = Reduction(self._aggregation.components, weights=weights).fit(centred, sizes=sizes)
             arrays |= {f"reduction.{name}": array for name, array in reduction.to_arrays().items()}
         return arrays | ({} if mean is None else {"mean_of_fit": mean})
 
-    def _layouts(self) -> np.ndarray:
-        """Return the layout of each frame, as `KLNetVLAD` puts it beside NetVLAD."""
-        found = []
+    def _parts(self) -> list[np.ndarray]:
+        """Return NetVLAD, and the layout where `KLNetVLAD` puts that beside it, of each frame of the drive."""
+        found: list[list[np.ndarray]] = [[] for _ in self._aggregation.part_weights]
         with torch.no_grad():
             for some in in_batches(self._members, TOGETHER):
                 codes = self._codes_of(np.array(some))
-                found.append(layout(codes.permute(0, 2, 3, 1).float().cpu().numpy()))
-        return np.concatenate(found)
+                found[0].append(self.network.layer(codes).cpu().numpy())
+                if len(found) > 1:
+                    found[1].append(layout(codes.permute(0, 2, 3, 1).float().cpu().numpy()))
+        return [np.concatenate(part) for part in found]
 
     def _mine(self, query: int, descriptors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         members = self.places.members

@@ -10,7 +10,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from calibration import TOLERANCE, WRONG, Remembered, cases
+from calibration import Remembered, cases, right_and_wrong
 
 from loopclosure import Config, LoopDetector
 from loopclosure.verification import Verifier
@@ -79,21 +79,19 @@ def figures(config, reference, images, true, loop, *, maps=None, local=None):
     decisions = [detector.add(image) for image in images]
     first = config.sequence.length - 1 + (int(loop.argmax()) if reference is None else 0)
     full = np.arange(len(images)) >= first
-    match = np.array([-1 if one.match is None else one.match for one in decisions])
+    off = np.abs(true - [np.nan if one.match is None else one.match for one in decisions])
     score = np.array([-np.inf if one.score is None else one.score for one in decisions])
     accepted = np.array([one.accepted for one in decisions])
-    right = (match >= 0) & (np.abs(match - true) <= TOLERANCE)
-    wrong = (match >= 0) & ~right & (full | ~loop) & (loop | (np.abs(match - true) > WRONG))
+    right, wrong = (which & ~np.isnan(off) for which in right_and_wrong(off, loop, full))
     worst = score[wrong].max(initial=0.0)
     if not loop.any():
         return np.nan, np.nan, np.nan, (wrong & accepted).sum(), worst
-    counted = right & loop & full
     total = (loop & full).sum()
     above = score > worst
     return (
-        counted.sum() / total,
-        (counted & above).sum() / total,
-        (counted & accepted).sum() / total,
+        right.sum() / total,
+        (right & above).sum() / total,
+        (right & accepted).sum() / total,
         (wrong & accepted).sum(),
         worst,
     )

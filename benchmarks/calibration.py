@@ -170,21 +170,30 @@ def fit(rows):
 
 
 def judge(rows, weights, constant):
-    """Return for each frame that has a candidate: log-odds of the best, whether it is right, far off, loop, full."""
+    """Return for each frame that has a candidate: log-odds of the best, frames it is off, loop, full."""
     odds = rows[:, len(COLUMNS) :] @ weights + constant
     order = np.lexsort((-odds, rows[:, 2]))
     best = order[np.r_[True, np.diff(rows[order, 2]) > 0]]
-    off = rows[best, 4]
-    return odds[best], off <= TOLERANCE, off > WRONG, rows[best, 5] > 0, rows[best, 6] > 0
+    return odds[best], rows[best, 4], rows[best, 5] > 0, rows[best, 6] > 0
+
+
+def right_and_wrong(off, loop, full):
+    """Return which candidates count as right and which as wrong.
+
+    Those of frames without a full sequence of the loop behind them count for neither, nor do those near the place of a
+    frame that the map just does not hold.
+    """
+    right = off <= TOLERANCE
+    return right & loop & full, ~right & (full | ~loop) & (loop | (off > WRONG))
 
 
 def figures(rows, weights, constant, bars):
-    odds, right, far, loop, full = judge(rows, weights, constant)
-    counted, wrong = loop & full, ~right & (full | ~loop) & (loop | far)
-    total = max(counted.sum(), 1)
+    odds, off, loop, full = judge(rows, weights, constant)
+    right, wrong = right_and_wrong(off, loop, full)
+    total = max((loop & full).sum(), 1)
     worst = odds[wrong].max(initial=-np.inf)
-    accepted = [((counted & right & (odds >= bar)).sum() / total, (wrong & (odds >= bar)).sum()) for bar in bars]
-    return (counted & right).sum() / total, (counted & right & (odds > worst)).sum() / total, accepted, counted.any()
+    accepted = [((right & (odds >= bar)).sum() / total, (wrong & (odds >= bar)).sum()) for bar in bars]
+    return right.sum() / total, (right & (odds > worst)).sum() / total, accepted, (loop & full).any()
 
 
 def main():
